@@ -22,16 +22,16 @@ def text_of(card: Card) -> list[str]:
 
 @pytest.mark.parametrize(
     ("ratio", "column", "mark"),
-    [(1.0, 18, "●"), (0.1, 0, "●"), (10.0, 36, "●"), (0.01, 0, "◀"), (128.0, 36, "▶")],
+    [(1.0, 21, "●"), (0.1, 5, "●"), (10.0, 37, "●"), (0.01, 5, "◀"), (128.0, 37, "▶")],
 )
 def test_sigma_ratio_text_plot_has_marker_at_column_of_ratio(ratio, column, mark) -> None:
     drawn = draw_sigma_ratio(ratio, "source")
-    assert (len(drawn), drawn.index(mark)) == (37, column)
+    assert (len(drawn), drawn.index(mark)) == (41, column)
 
 
 def test_sigma_ratio_plot_without_ratio_shows_consistent_range() -> None:
-    assert re.fullmatch("─{16}░{5}─{16}", draw_sigma_ratio(None, "source"))
-    assert re.fullmatch("─{15}░{7}─{15}", draw_sigma_ratio(None, "truth"))
+    assert re.fullmatch("1/10 ─{14}░{5}─{14} 10", draw_sigma_ratio(None, "source"))
+    assert re.fullmatch("1/10 ─{13}░{7}─{13} 10", draw_sigma_ratio(None, "truth"))
 
 
 def test_diagnosis_text_has_at_most_40_lines() -> None:
@@ -44,11 +44,11 @@ def test_diagnosis_text_has_at_most_40_lines() -> None:
         assert part in whole
 
 
-def test_diagnosis_text_below_95_columns_has_ratios_without_plot() -> None:
+def test_diagnosis_text_below_98_columns_has_ratios_without_plot() -> None:
     card = replace(SMALL_SIGMA_A, causes=())
     wide, narrow = (
         [text for line in card_text.format_card_lines(card) for text in line.wrap(width)]
-        for width in (95, 80)
+        for width in (98, 80)
     )
     assert any("─░" in text for text in wide)
     assert not any("─" in text for text in narrow)
@@ -62,12 +62,11 @@ def test_diagnosis_text_numbers_alternative_actions() -> None:
     lines = text_of(card)
     (first,) = (at for at, line in enumerate(lines) if line.startswith("  option 1: sender  "))
     assert SENDER.sentence in lines[first]
-    assert lines[first + 1].startswith("  option 2: EKF2 (console)  EKF2_EV_DELAY 0 → 264 ms")
+    assert lines[first + 1].startswith("  option 2: EKF2    set in the MAVLink Console")
     assert lines[first + 2].split() == ["param", "set", "EKF2_EV_DELAY", "264"]
-    assert lines[first + 3].startswith("  also: KF (shell)  ")
-    explanation, console = (line.text for line in card_text.format_closing_lines(card))
+    assert lines[first + 3].startswith("  also: KF          run again: px4fuse compare ")
+    (explanation,) = (line.text for line in card_text.format_closing_lines(card))
     assert explanation.endswith(f"px4fuse explain {card.id}")
-    assert console == "Console: MAVLink Console of QGroundControl"
 
 
 def test_verbose_diagnosis_does_not_advise_verbose_output() -> None:

@@ -197,7 +197,7 @@ def test_each_kf_setting_is_in_options_ranges_and_results() -> None:
 def test_setting_without_unit_prints_no_dangling_blank(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(SETTING_RANGES, "dt_s", Range(1.0, 5.0, "", "GATE"))
     assert SETTING_RANGES["dt_s"].format_label() == "GATE"
-    assert "GATE 3, input imu" in format_settings(Settings(dt_s=3.0))
+    assert "GATE 3, acceleration input imu" in format_settings(Settings(dt_s=3.0))
     with pytest.raises(SettingsError, match=r"give 1 to 5\.$"):
         Settings(dt_s=9.0)
 

@@ -280,7 +280,11 @@ def test_severity_of_rejections_depends_on_rejected_percentage(
     level = analysis(ekf2={"gate": 5.0}, axes=axes)
     down = analysis(ekf2={"gate": 5.0}, axes=(axis("down", ekf2_innovations=rejected(count, of)),))
     for one, quantity, remedy in (
-        (level, "of the positions. Their innovations are outside its gate of 5 √S", CHECK_FIRST),
+        (
+            level,
+            "of the positions. The rejected innovations are outside EKF2's gate of 5 √S",
+            CHECK_FIRST,
+        ),
         (down, "of the heights", CHECK_FIRST),
     ):
         assert severity(ekf2_settings.detect_rejections, one) == expected
@@ -541,7 +545,7 @@ def test_heading_error_action_depends_on_rerun_with_gnss_noise(degrees, noise_is
 
 def test_heading_angles_are_printed_from_minus_180_to_180_deg() -> None:
     finding = only(source_frame.detect, analysis(heading=heading_error(170.0, 230.0, p=0.0)))
-    assert "Its error is +170° from 0 to 10 s and -130° from 10 to 20 s" in finding.message
+    assert "The heading error is +170° from 0 to 10 s and -130° from 10 to 20 s" in finding.message
     finding = only(source_frame.detect, analysis(heading=heading_error(340.0)))
     assert "rotated by -20°" in finding.title
 

@@ -94,15 +94,17 @@ def test_info_sample_counts_match_those_of_compare(sample_flight):
     assert all(ability.possible for ability in inventory.abilities)
     assert inventory.segment == comparison.segment
     assert all(remedies(inventory))
-    assert "external vision, position 2 Hz, " in ability(inventory, "aids").reason
+    assert (
+        "external vision, position: 2 Hz; " in ability(inventory, "aiding sources of EKF2").reason
+    )
     north = comparison.axes["north"]
     for name, samples in (
         ("EKF2 states", north.ekf2_state),
         ("EKF2 variances", north.ekf2_variance),
         ("EKF2 consistency", north.ekf2_innovations),
-        ("error", north.truth),
+        ("position error", north.truth),
     ):
-        assert ability(inventory, name).reason.startswith(f"{len(samples)} ")
+        assert ability(inventory, name).reason.startswith(f"from {len(samples)} ")
 
 
 # ---- JSON -------------------------------------------------------------------------------------
@@ -136,12 +138,14 @@ def test_info_json_is_written_to_named_file_or_stdout(
 @pytest.mark.parametrize(("topic_", "part", "lost"), [
     ("sensor_combined", "IMU", {"acceleration", "what-if"}),
     ("vehicle_local_position", "EKF2 state",
-     {"EKF2 states", "EKF2 variances", "EKF2 consistency", "aids", "what-if"}),
+     {"EKF2 states", "EKF2 variances", "EKF2 consistency", "aiding sources of EKF2", "what-if"}),
 ])  # fmt: skip
 def test_info_lists_analyses_disabled_by_missing_topic(tmp_path, topic_, part, lost):
     inventory = inventory_of(make_log().drop(topic_), tmp_path)
     assert topic_ in source(inventory, part).unavailable
-    assert {can.name for can in inventory.abilities if not can.possible} - {"error"} == lost
+    assert {can.name for can in inventory.abilities if not can.possible} - {
+        "position error"
+    } == lost
     assert all(f"{topic_} is not logged" in ability(inventory, name).reason for name in lost)
     assert remedies(inventory).count("Record with SDLOG_PROFILE bit 0 (default).") == 1
 
@@ -207,11 +211,11 @@ def test_info_on_log_without_take_off_reports_never_airborne(tmp_path):
 
 def test_info_does_not_use_position_source_as_ground_truth(tmp_path):
     log = make_log().add(odometry("vehicle_mocap_odometry", 10.0, 16))
-    assert ability(inventory_of(log, tmp_path), "error").possible
+    assert ability(inventory_of(log, tmp_path), "position error").possible
     flight = read_log(log.drop("vehicle_visual_odometry").write(tmp_path / "made.ulg"))
     inventory = list_log_contents(flight)
     assert source(inventory, "position").name == "vehicle_mocap_odometry"
-    assert not ability(inventory, "error").possible
+    assert not ability(inventory, "position error").possible
 
 
 # ---- gaps -------------------------------------------------------------------------------------
@@ -267,7 +271,7 @@ def test_info_lists_exactly_the_analyses_that_compare_performs(flight: Flight):
         ("EKF2 states", north.ekf2_state),
         ("EKF2 variances", north.ekf2_variance),
         ("EKF2 consistency", north.filters["ekf2"]),
-        ("error", north.truth),
+        ("position error", north.truth),
     ):
         assert ability(inventory, name).possible != isinstance(part, Unavailable), name
 

@@ -286,7 +286,7 @@ def test_mcp_tool_returns_same_results_as_its_command() -> None:
             expected = results_of(name)
             if name == "diagnose":
                 expected = expected["card"]
-                assert "do this  Change nothing." in text_of(answer)
+                assert "action   Change nothing." in text_of(answer)
             assert answer.structured_content == expected
         for file in ("aisle_uwb.tlog", "loop_vio.ulg"):
             answer = await client.call_tool("diagnose", {"log": file})

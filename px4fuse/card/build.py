@@ -72,8 +72,8 @@ MIN_REPORTED_REJECTED_FRACTION = 0.01
 # Aiding sources for which EKF2's √S is usually too large with PX4's default noises
 USUALLY_UNDERCONFIDENT_AIDS = frozenset({"baro_hgt", "mag", "gravity"})
 SMALL_INNOVATIONS_EXPLANATION = (
-    "The innovations are smaller than expected. This is not a fault here: the source may drift, "
-    "and innovations do not show drift. Do not reduce noise settings."
+    "The innovations are smaller than expected. Small innovations are not a fault here: the "
+    "source may drift, and innovations do not show drift. Do not reduce noise settings."
 )
 PRINTED_FIRST_BYTES = 4  # number of first bytes of an unreadable log that are printed
 ULOG_FIRST_BYTES = "55 4C 6F 67"  # first bytes of each ULog file (hexadecimal)
@@ -356,13 +356,13 @@ def _describe_worst_axis(analysis: Analysis) -> list[str]:
         return []
     rmse_m = _find_rmse_by_filter_m(worst_result)["ekf2"]
     return [
-        f"EKF2's RMSE along {worst_result.axis.label} is {format_metres(rmse_m)} m, "
+        f"EKF2's position RMSE along {worst_result.axis.label} is {format_metres(rmse_m)} m, "
         f"{format_ratio(ratio)} times its reported σ."
     ]
 
 
 def _format_difference(rms_m: float) -> str:
-    return f"RMS difference KF − EKF2 along the main axis: {format_metres(rms_m)} m"
+    return f"RMS position difference KF − EKF2 along the main axis: {format_metres(rms_m)} m"
 
 
 def _format_lengths(length_by_filter_m: Mapping[FilterName, float]) -> str:
@@ -388,8 +388,8 @@ def _format_actions(causes: Sequence[DiagnosedCause], notes: Sequence[Note]) -> 
             for action in cause.actions
             if action.commands or action.changes_something()
         ]
-        label = f"Cause {number}: " if len(causes) > 1 else ""
-        numbered_sentences += [f"{label}{sentence}." for sentence in sentences]
+        label = f"Cause {number}, " if len(causes) > 1 else ""
+        numbered_sentences += [capitalise_first(f"{label}{sentence}.") for sentence in sentences]
     return tuple(dict.fromkeys(numbered_sentences))[:MAX_ACTIONS]
 
 
@@ -403,7 +403,7 @@ def _format_action(action: Action) -> str:
         options_text = action.commands[0].partition(" --")[2]
         return f"KF: run again with --{options_text}"
     text = lowercase_first_letter(action.sentence.rstrip("."))
-    return f"{capitalise_first(action.target)}: {text}"
+    return f"{action.target}: {text}"
 
 
 def _mark_explained_verdicts(
@@ -530,8 +530,8 @@ def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCau
     }
     if len(corrected_filters) == 2:
         return (
-            f"{difference_text}. The first fault affects both KF and EKF2, so their difference "
-            "hardly shows it."
+            f"{difference_text}. The first fault affects both KF and EKF2, so the difference KF − "
+            "EKF2 hardly shows the fault."
         )
     rerun_difference_by_filter_m = {
         rerun.filter: rerun.after.difference_rms_m for rerun in reversed(reruns)

@@ -167,7 +167,7 @@ def make_cause(
         make_cause_without_reruns(finding),
         alternatives=alternative_action_groups,
         actions=actions,
-        reruns=tuple(_make_card_rerun(rerun, reruns) for rerun in reruns if can_show_effect(rerun)),
+        reruns=tuple(map(_make_card_rerun, filter(can_show_effect, reruns))),
         after=_format_closing_sentence(
             useful_reruns, has_alternatives=bool(alternative_action_groups)
         ),
@@ -335,7 +335,7 @@ def make_parameter_action(analysis: Analysis, change: Mapping[str, float]) -> Ac
     return Action("EKF2", ", ".join(change_texts), tuple(commands), "console")
 
 
-def _make_card_rerun(rerun: Rerun, reruns: Sequence[Rerun]) -> CardRerun:
+def _make_card_rerun(rerun: Rerun) -> CardRerun:
     before, after = rerun.before, rerun.after
     values_before_and_after: dict[str, Any] = {
         f"{reference}_ratio": tuple(ratios) for reference, *ratios in compare_sigma_ratios(rerun)
@@ -345,7 +345,7 @@ def _make_card_rerun(rerun: Rerun, reruns: Sequence[Rerun]) -> CardRerun:
     if max(fraction or 0.0 for fraction in rejected_fractions) >= MIN_REJECTED_FRACTION_TO_SHOW:
         values_before_and_after["rejected_fraction"] = rejected_fractions
     return CardRerun(
-        label=_format_rerun_label(rerun, reruns),
+        label=_format_rerun_label(rerun),
         is_prediction=rerun.filter == "ekf2",
         from_s=rerun.from_s,
         improves=classify_improvement(rerun),
@@ -353,22 +353,20 @@ def _make_card_rerun(rerun: Rerun, reruns: Sequence[Rerun]) -> CardRerun:
     )
 
 
-def _format_rerun_label(rerun: Rerun, reruns: Sequence[Rerun]) -> str:
-    kind, is_ekf2 = rerun.kinds[0], rerun.filter == "ekf2"
-    label = FILTER_NAMES[rerun.filter] + (" (replay)" if is_ekf2 else "")
+def _format_rerun_label(rerun: Rerun) -> str:
+    kind = rerun.kinds[0]
+    label = FILTER_NAMES[rerun.filter] + " (replay)" * (rerun.filter == "ekf2")
     if OUTLIERS_KEY in rerun.change:
         return f"{label} without {rerun.change[OUTLIERS_KEY]:.0f} outliers"
-    if not is_ekf2:
-        options_text = " ".join(
-            f"{COMPARISON_OPTIONS[name]} {value:g}"
-            for name, value in rerun.change.items()
-            if name in (SIGMA_A, SIGMA_Z)
-        )
-        prefix = "default " if kind == "defaults" else ""
-        return f"{label}, {prefix}{options_text}" if options_text else label
-    if sum(other_rerun.filter == "ekf2" for other_rerun in reruns) < 2:
-        return label
-    return f"{label}, {'sender' if kind == 'time offset' else 'parameters'}"
+    if kind == "time offset":
+        return f"{label}, corrected time offset"
+    prefix = "default " if kind == "defaults" else ""
+    change_texts = [
+        f"{prefix}{COMPARISON_OPTIONS.get(name, name)} {value:g}"
+        for name, value in rerun.change.items()
+        if name in {*PARAMETERS, SIGMA_A, SIGMA_Z}
+    ]
+    return ", ".join([label, *change_texts])
 
 
 def _format_closing_sentence(useful_reruns: Sequence[Rerun], *, has_alternatives: bool) -> str:
@@ -387,7 +385,7 @@ def _format_closing_sentence(useful_reruns: Sequence[Rerun], *, has_alternatives
         and classify_sigma_ratio(min(sigma_ratios_against_truth), "truth") == "overconfident"
     ):
         return (
-            "After this correction, the reported σ is still too small against ground truth: "
+            "After the tested change, the reported σ is still too small against ground truth: "
             "another error remains."
         )
     return ""

@@ -298,7 +298,7 @@ def _check_interval(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
             "interval",
             f"the positions come at {positions.source.compute_rate_hz():.2g} Hz",
             "EKF2 (v1.14 and later) starts to fuse external vision only when two positions come "
-            f"within {EV_START_INTERVAL_S:g} s. No parameter changes this limit.",
+            f"within {EV_START_INTERVAL_S:g} s. No parameter changes this minimum rate.",
             "Send the position at 10 Hz.",
         )
 

@@ -168,8 +168,8 @@ def _find_rejections(analysis: Analysis, gate: float) -> Findings:
             yield finding(
                 "error" if rejected_fraction >= REJECTED_FRACTION_FOR_ERROR else "warning",
                 "ekf2_rejects_positions",
-                f"EKF2 rejects {format_percent(rejected_fraction)} of the {quantity}. Their "
-                f"innovations are outside its gate of {gate:g} √S.",
+                f"EKF2 rejects {format_percent(rejected_fraction)} of the {quantity}. The "
+                f"rejected innovations are outside EKF2's gate of {gate:g} √S.",
                 _find_rejection_remedy(analysis, result),
                 {
                     "rejected_fraction": rejected_fraction,

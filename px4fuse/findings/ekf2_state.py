@@ -116,7 +116,7 @@ def _detect_bias_at_limit(
         median_bias = float(bias_states[columns[axis_index]].median())
         message = (
             f"EKF2's {sensor} bias is at its limit {parameter} {limit:.3g} {unit} for "
-            f"{format_percent(limited_fraction)} of the flight. The estimate is "
+            f"{format_percent(limited_fraction)} of the flight. The bias estimate is "
             f"{median_bias:+.3g} {unit} {BODY_AXES[axis_index]}."
         )
         if sensor == "accelerometer" and median_imu_at_rest is not None:

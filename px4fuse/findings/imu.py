@@ -86,7 +86,7 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
         bias_m_s2, evidence = horizontal_bias.value, {"sigma_m_s2": horizontal_bias.sigma}
         message = (
             f"The accelerometer is biased by {forward_bias.value:+.2f} m/s² forward and "
-            f"{systematic_errors.right_bias_m_s2.value:+.2f} m/s² right. The estimate is from the "
+            f"{systematic_errors.right_bias_m_s2.value:+.2f} m/s² right, estimated from the "
             f"positions (± {1.96 * forward_bias.sigma:.2f} m/s², 95 %). A tilt error of "
             f"{bias_m_s2 * TILT_DEG_PER_M_S2:.1f}° has the same effect."
         )
@@ -113,7 +113,7 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
             error_m_s2 = estimate_mean_acceleration_error(result.axis) or 0.0
         bias_m_s2 = abs(error_m_s2)
         message = (
-            f"The accelerometer is biased by {error_m_s2:+.2f} m/s² down. The estimate is from "
+            f"The accelerometer is biased by {error_m_s2:+.2f} m/s² down, estimated from "
             "the heights of the position source. An accelerometer scale factor of "
             f"{1.0 - error_m_s2 / constants.g:.3f} has the same effect."
         )
@@ -213,7 +213,7 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
     yield make_warning(
         "imu_samples_missing",
         f"{format_percent(lost_fraction)} of the IMU samples are missing from the log. KF "
-        "increases Q in these gaps. EKF2 cannot be replayed with changed parameters.",
+        "increases Q in the IMU gaps. EKF2 cannot be replayed with changed parameters.",
         f"{action}.",
         {"lost_fraction": lost_fraction, "sdlog_profile": sdlog_profile},
     )

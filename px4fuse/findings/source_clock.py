@@ -72,9 +72,9 @@ def detect_time_offset(analysis: Analysis, time_offset: SourceTimeOffset) -> Fin
     yield finding(
         "error" if offset_s > MIN_OFFSET_FOR_ERROR_S else "warning",
         "source_time_offset",
-        f"Position timestamps are {offset_s:.2f} s {late_or_early}. The estimate from IMU and "
-        f"positions is {offset_s:.3f} s (95 % {low_s:.3f} to {high_s:.3f} s). At 1 m/s this is a "
-        f"position error of {offset_s:.2f} m, which innovations hardly "
+        f"Position timestamps are {offset_s:.2f} s {late_or_early}. The time offset estimated from "
+        f"IMU and positions is {offset_s:.3f} s (95 % {low_s:.3f} to {high_s:.3f} s). At 1 m/s, "
+        f"this offset is a position error of {offset_s:.2f} m, which innovations hardly "
         f"show.{_format_assumed_delay(analysis, time_offset)}",
         _find_offset_remedy(analysis, time_offset),
         evidence,

@@ -288,7 +288,7 @@ def _detect_orientation_faults(
     }[faults.orientation]
     yield make_error(
         "source_orientation_wrong",
-        f"{fault_text}. If EKF2 fuses this yaw, EKF2's heading becomes wrong.",
+        f"{fault_text}. If EKF2 fuses the yaw of the source, EKF2's heading becomes wrong.",
         f"{action} Until the orientation is correct, do not fuse the yaw (EKF2_EV_CTRL bit 3).",
         evidence,
     )

@@ -134,7 +134,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     yield (make_note if is_normal else make_warning)(
         "source_noise_time_correlated",
         f"Time-correlated {analysis.source.kind_name} error of {noise.slow_m:.2g} m, "
-        f"correlation time {time_text}. The rest of the error is white noise of "
+        f"correlation time {time_text}. The remaining error is white noise of "
         f"{noise.white_m:.2g} m (1 σ). KF and EKF2 assume independent errors: both follow the "
         "correlated error, and their σ is too small.",
         f"{find_source_texts(analysis.source).slow_error_check}.",

@@ -181,9 +181,9 @@ def _make_heading_drift_finding(analysis: Analysis, heading_error: HeadingError)
         "error" if abs(heading_change_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_error",
         f"EKF2's heading drifts by {heading_change_deg:+.0f}° relative to the "
-        f"{source.positions_phrase}. Its error is {' and '.join(error_texts)} (clockwise from "
-        f"above, estimated from {estimation_data_text}). A constant rotation of the positions "
-        f"cannot correct the drift. Possible cause: {possible_cause}.",
+        f"{source.positions_phrase}. The heading error is {' and '.join(error_texts)} "
+        f"(clockwise from above, estimated from {estimation_data_text}). A constant rotation of "
+        f"the positions cannot correct the drift. Possible cause: {possible_cause}.",
         " Alternatively: ".join(filter(None, (calibration_advice, action)))
         or "Check the heading source of EKF2.",
         {

@@ -239,7 +239,7 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
             "source_samples_lost",
             f"The recording lacks {format_percent(lost_fraction)} of the "
             f"{source.positions_phrase}. {lost_count} of {sent_count} positions are missing (one "
-            f"per {median_interval_s:.2f} s is expected). EKF2 may have received them.",
+            f"per {median_interval_s:.2f} s is expected). EKF2 may have received these samples.",
             "Record on the companion computer or on a link without message loss. Or set "
             "SDLOG_PROFILE to 129: the ULog then contains the received positions.",
             {"lost": lost_count, "lost_fraction": lost_fraction},

@@ -395,7 +395,7 @@ def make_scale_finding(
         "error" if abs(scale_error) >= MIN_SCALE_ERROR_FOR_SEVERITY_ERROR else "warning",
         "source_scale_error",
         f"{source.kind_name} distances are {format_percent(abs(scale_error))} too "
-        f"{'long' if scale_error > 0.0 else 'short'}. The estimate is from {reference}. "
+        f"{'long' if scale_error > 0.0 else 'short'}. The scale is estimated from {reference}. "
         "Innovations do not show a scale factor error.",
         action,
         {"scale": 1.0 + scale_error, "sigma": sigma},

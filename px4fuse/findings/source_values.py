@@ -325,7 +325,7 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
         "source_is_ekf2_estimate",
         f"{source.kind_name} sends EKF2's own position{' and attitude' * is_attitude_copied} "
         f"back. The positions equal those that EKF2 estimated {1e3 * delay_s:.0f} ms before "
-        f"(median difference {1e3 * distance_m:.1f} mm). They are not measurements.",
+        f"(median difference {1e3 * distance_m:.1f} mm). These copies are not measurements.",
         "Send the position of the positioning system. Do not connect the autopilot's local "
         "position (MAVROS local_position) to its vision input.",
         {"delay_s": delay_s, "difference_m": distance_m},

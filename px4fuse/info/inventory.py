@@ -296,20 +296,21 @@ def _list_analyses(
     imu_fault_text = " ".join(finding.message for finding in low_rate_findings)
     if isinstance(missing_data := imu_and_attitude(flight), Unavailable):
         imu_fault_text = f"{missing_data.reason}; KF assumes constant velocity"
-    acceleration_text = "IMU acceleration rotated into NED by the attitude, without gravity"
+    acceleration_text = "IMU acceleration as input of KF, in NED and without gravity"
     yield AnalysisOption("acceleration", not imu_fault_text, imu_fault_text or acceleration_text)
     yield from _list_ekf2_and_truth_analyses(flight, comparison)
     results_by_aid, ekf2 = evaluate_aids(flight), flight.ekf2
     if isinstance(results_by_aid, Unavailable):
-        yield AnalysisOption("aids", False, results_by_aid.reason)
+        yield AnalysisOption("aiding sources of EKF2", False, results_by_aid.reason)
     elif isinstance(ekf2, Ekf2):
         rate_texts = (
-            f"{aid.label} {sample_rate(samples):.2g} Hz"
+            f"{aid.label}: {sample_rate(samples):.2g} Hz"
             if len(samples := ekf2.aids[name].samples) > 1
-            else f"{aid.label} 1 sample"
+            else f"{aid.label}: 1 sample"
             for name, aid in results_by_aid.items()
         )
-        yield AnalysisOption("aids", True, ", ".join(rate_texts))
+        rates_text = f"innovations of {'; '.join(rate_texts)}"
+        yield AnalysisOption("aiding sources of EKF2", True, rates_text)
     replay_inputs = prepare_inputs(flight)
     if isinstance(replay_inputs, Unavailable):
         yield AnalysisOption("what-if", False, replay_inputs.reason)
@@ -343,10 +344,10 @@ def _list_ekf2_and_truth_analyses(
             "samples of EKF2's position and velocity variances",
         ),
         ("EKF2 consistency", innovations, "EKF2 innovations"),
-        ("error", tracks["truth"], "samples of ground truth"),
+        ("position error", tracks["truth"], "samples of ground truth"),
     ):
         if isinstance(data, pd.DataFrame):
-            yield AnalysisOption(name, True, f"{len(data)} {sample_text}")
+            yield AnalysisOption(name, True, f"from {len(data)} {sample_text}")
         elif isinstance(data, Unavailable):
             yield AnalysisOption(name, False, data.reason)
         else:

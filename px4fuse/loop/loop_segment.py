@@ -192,7 +192,7 @@ def find_final_pose_in_truth(
         heading_change_deg=true_heading_change_deg,
         sigma_m=0.02,
         sigma_heading_deg=None if true_heading_change_deg is None else 0.5,
-        source=f"ground truth in the log ({truth.name}): landing "
+        source=f"from ground truth in the log ({truth.name}): landing "
         f"{start_to_landing_distance_m:.2f} m from the take-off place",
         assumed=False,
     )

@@ -28,8 +28,8 @@ from px4fuse.finding import format_spans
 from px4fuse.request import quote_command
 
 CARD_WIDTH = 100  # characters per line
-AXIS_WIDTH = 37  # characters of the axis of σ ratios (actual σ ÷ reported σ)
-AXIS_INDENT = 58  # characters left of the axis of σ ratios
+AXIS_WIDTH = 33  # characters of the axis of σ ratios (actual σ ÷ reported σ), without its ends
+AXIS_INDENT = 57  # characters left of the axis of σ ratios
 TEXT_INDENT = 11  # characters left of a text, which contain its label
 # Ticks with labels on the axis of σ ratios
 LABELLED_RATIO_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
@@ -48,9 +48,24 @@ SEVERITY_STYLES = {
     "note": "cyan",
     "clean": "bold green",
 }
+# Place where a user types the commands of an action
+PLACE_TEXTS = {
+    "": "",
+    "shell": "run again: ",
+    "console": "set in the MAVLink Console of QGroundControl: ",
+}
 # Replacements of characters that ASCII terminals cannot print
 ASCII_REPLACEMENTS = str.maketrans("░●◆◀▶─÷−–²³×", ":ox<>-/--23x") | str.maketrans(
-    {"√": "sqrt ", "σ": "sigma", "→": "->", "°": " deg", "±": "+-", "ν": "nu", "…": "..."}
+    {
+        "√": "sqrt ",
+        "σ": "sigma",
+        "→": "->",
+        "←": "<-",
+        "°": " deg",
+        "±": "+-",
+        "ν": "nu",
+        "…": "...",
+    }
 )
 # Each sentence begins on a new line
 SENTENCE_END_PATTERN = re.compile(r"(?<=\.) (?=[A-Z])")
@@ -107,7 +122,7 @@ def format_card_lines(card: Card) -> Iterator[Paragraph]:
     yield from _format_identity_lines(card)
     yield make_headline(card)
     yield _make_labelled_paragraph("effect", card.effect_text)
-    for label, text in zip(("do this", "", ""), card.do_this, strict=False):
+    for label, text in zip(("action", "", ""), card.do_this, strict=False):
         yield _make_labelled_paragraph(label, text)
     for number, cause in enumerate(card.causes, start=1):
         if number > 1:
@@ -141,17 +156,11 @@ def note_texts(card: Card) -> list[str]:
 
 
 def format_closing_lines(card: Card, *, verbose: bool = False) -> Iterator[Paragraph]:
-    """Yield the last lines of a diagnosis card: commands for details, and terms."""
+    """Yield the last line of a diagnosis card: commands for details."""
     texts = [] if verbose else ["More: -v"]
     if card.id:
         texts.append(f"Explanation of the finding: px4fuse explain {card.id}")
     yield Paragraph("; ".join(texts), wrap_indent="")
-    if any(
-        action.where == "console"
-        for cause in card.causes
-        for _, action in label_alternatives(cause)
-    ):
-        yield Paragraph("Console: MAVLink Console of QGroundControl")
 
 
 def with_typed_path(card: Card, path: str) -> Card:
@@ -200,9 +209,9 @@ def draw_sigma_ratio(ratio: float | None, reference: Reference) -> str:
     """Draw a σ ratio as text on a logarithmic axis with the band of consistent ratios.
 
     >>> draw_sigma_ratio(0.93, "source")
-    '────────────────░●░░░────────────────'
+    '1/10 ──────────────░●░░░────────────── 10'
     >>> draw_sigma_ratio(128.0, "truth")
-    '───────────────░░░░░░░──────────────▶'
+    '1/10 ─────────────░░░░░░░────────────▶ 10'
     """
     first_band_column, last_band_column = (
         _compute_axis_column(end) for end in CONSISTENT_SIGMA_RATIOS[reference]
@@ -217,7 +226,7 @@ def draw_sigma_ratio(ratio: float | None, reference: Reference) -> str:
             "◀" if column < 0 else "▶" if column > last_column else SYMBOL_BY_REFERENCE[reference]
         )
         characters[min(max(column, 0), last_column)] = symbol
-    return "".join(characters)
+    return f"1/10 {''.join(characters)} 10"
 
 
 def locate_sigma_ratio(
@@ -273,7 +282,7 @@ def _format_cause_lines(cause: DiagnosedCause, do_this: str) -> Iterator[Paragra
         for prefix, action in label_alternatives(cause)
         if prefix or action.commands or action.sentence[1:] not in do_this
     ]
-    labels = [f"{prefix}{format_target(action)}" for prefix, action in actions]
+    labels = [f"{prefix}{action.target}" for prefix, action in actions]
     label_width = max(map(len, labels), default=0) + 2
     for label, (_, action) in zip(labels, actions, strict=True):
         yield from _format_action_lines(label, label_width, action)
@@ -291,15 +300,14 @@ def label_alternatives(cause: DiagnosedCause) -> list[tuple[str, Action]]:
     return alternatives + [("also: " if alternatives else "", action) for action in cause.actions]
 
 
-def format_target(action: Action) -> str:
-    return f"{action.target} ({action.where})" if action.where else action.target
-
-
 def _format_action_lines(label: str, label_width: int, action: Action) -> Iterator[Paragraph]:
     indent, label_text = " " * (2 + label_width), f"  {label:{label_width}}"
+    place_text = PLACE_TEXTS[action.where]
     if action.sentence:
-        yield Paragraph(action.sentence, label_text, indent)
+        yield Paragraph(f"{place_text}{action.sentence}", label_text, indent)
         label_text = indent
+    else:
+        label_text += place_text
     for command in action.commands:
         yield Paragraph(f"{label_text}{command}", style="bold")
         label_text = indent
@@ -307,6 +315,12 @@ def _format_action_lines(label: str, label_width: int, action: Action) -> Iterat
 
 def _format_rerun_table(reruns: Sequence[CardRerun]) -> Iterator[Paragraph]:
     rows = make_rerun_rows(reruns)
+    for row in rows[1:]:
+        # Each cell begins with the first word or symbol of its heading
+        row[1:-1] = [
+            f"{heading.removeprefix('position ').split()[0]} {cell}" if cell else ""
+            for heading, cell in zip(rows[0][1:-1], row[1:-1], strict=True)
+        ]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
@@ -323,7 +337,7 @@ def make_rerun_rows(reruns: Sequence[CardRerun]) -> list[list[str]]:
             "● innovation ÷ √S": _format_before_after(rerun.source_ratio, format_ratio),
             "◆ error ÷ σ": _format_before_after(rerun.truth_ratio, format_ratio),
             "rejected": _format_before_after(rerun.rejected_fraction, _format_percent, " %"),
-            "result": f"improves {rerun.improves}"
+            "result": f"improves {rerun.improves.removesuffix(' only')}"
             if rerun.improves != "nothing"
             else "no improvement",
         }
@@ -364,12 +378,11 @@ def _format_verdict_lines(card: Card) -> Iterator[Paragraph]:
         return
     direction_text = "" if card.effect is None else f" {card.effect.axis}"
     yield Paragraph("")
-    heading = f"Consistency{direction_text} (RMS of error ÷ reported σ; 1: consistent)"
+    heading = f"Consistency{direction_text}: RMS of error ÷ reported σ (expected 1)"
     yield Paragraph(heading, "", "  ")
-    legend, too_large_label = f"  ░ consistent ({format_consistent_ratios()})", "σ too large"
+    legend = f"  ░ consistent ({format_consistent_ratios()})"
     yield Paragraph(
-        f"{'':{AXIS_INDENT}}",
-        plot=f"{too_large_label}{'σ too small':>{AXIS_WIDTH - len(too_large_label)}}",
+        f"{'':{AXIS_INDENT}}", plot=f"← reported σ too large{'too small →':>{AXIS_WIDTH - 14}}"
     )
     yield Paragraph(f"{legend:{AXIS_INDENT}}", plot=_format_tick_labels())
     if any(verdict.is_explained for verdict in card.verdicts):
@@ -378,13 +391,12 @@ def _format_verdict_lines(card: Card) -> Iterator[Paragraph]:
 
 
 def _format_verdict_line(verdict: Verdict) -> Paragraph:
-    filter_label = FILTER_NAMES[verdict.filter] if verdict.against == "source" else ""
-    label_text = f"  {filter_label:4} {QUANTITY_LABELS[verdict.against]:26}"
+    label_text = f"  {FILTER_NAMES[verdict.filter]:4} {QUANTITY_LABELS[verdict.against]:26}"
     if verdict.ratio is None:
-        verdict_text = f"{'–':>6}  not evaluated: {verdict.reason}"
+        verdict_text = f"{'–':>5}  not evaluated: {verdict.reason}"
         return Paragraph(verdict_text, label_text, " " * 40)
     verdict_word = f"({verdict.word})" if verdict.is_explained else verdict.word
-    verdict_text = f"{label_text}{format_ratio(verdict.ratio):>6}  {verdict_word}"
+    verdict_text = f"{label_text}{format_ratio(verdict.ratio):>5}  {verdict_word}"
     return Paragraph(
         f"{verdict_text:{AXIS_INDENT}}",
         style="bold" if verdict.is_fault else "",
@@ -394,11 +406,11 @@ def _format_verdict_line(verdict: Verdict) -> Paragraph:
 
 def _format_tick_labels() -> str:
     characters = [" "] * AXIS_WIDTH
-    for tick in LABELLED_RATIO_TICKS:
+    for tick in LABELLED_RATIO_TICKS[1:-1]:
         label = RATIO_AXIS_TICKS[tick]
-        start = min(max(_compute_axis_column(tick) - len(label) // 2, 0), AXIS_WIDTH - len(label))
+        start = _compute_axis_column(tick) - len(label) // 2
         characters[start : start + len(label)] = label
-    return "".join(characters)
+    return f"{'':5}{''.join(characters).rstrip()}"
 
 
 def _format_aid_lines(aid_rows: Sequence[AidConsistency]) -> Iterator[Paragraph]:
@@ -408,10 +420,9 @@ def _format_aid_lines(aid_rows: Sequence[AidConsistency]) -> Iterator[Paragraph]
     yield Paragraph(AIDS_CAPTION, "", "  ")
     indent = 31
     yield Paragraph(f"{'':{indent}}", plot=_format_tick_labels())
-    for row, previous_row in zip(aid_rows, (None, *aid_rows), strict=False):
-        label = "" if previous_row and row.label == previous_row.label else row.label
+    for row in aid_rows:
         ratio_text = "–" if row.ratio is None else format_ratio(row.ratio)
-        label_text = f"  {label:13}{row.component:6}{ratio_text:>7}"
+        label_text = f"  {row.label:13} {row.component:5}{ratio_text:>7}"
         yield Paragraph(f"{label_text:{indent}}", plot=draw_sigma_ratio(row.ratio, "source"))
 
 

@@ -141,7 +141,7 @@ def _make_verdict_row(verdict: Verdict) -> dict[str, Any]:
         verdict.against,
         verdict.interval,
         filter=verdict.filter,
-        label=FILTER_NAMES[verdict.filter] if verdict.against == "source" else "",
+        label=FILTER_NAMES[verdict.filter],
         quantity=QUANTITY_LABELS[verdict.against],
         word=f"not evaluated: {verdict.reason}" if verdict.ratio is None else word,
         quiet=verdict.is_explained,

@@ -158,7 +158,7 @@ def write_evaluation(page: Page, evaluation: Evaluation) -> None:
     page.write_labelled("Method", describe_method(evaluation))
     for text in evaluation.warnings:
         page.write(text, bold=True, colour=style.SEVERITY_COLOURS["warning"])
-    head = ["error", "RMSE", "95 %", "mean", "median", "std", "max", "n", "rotation\nRMSE (°)"]
+    head = ["error", "RMSE", "95 %", "mean", "median", "std", "max", "n", "rotation RMSE (°)"]
     page.add_table(head, _make_error_rows(evaluation), right_aligned_columns=range(1, len(head)))
     ate, rpe_translations = evaluation.ate, (error.translation_m for error in evaluation.rpe)
     missing_reasons = {

@@ -48,9 +48,12 @@ def make_finding_page(finding_id: str) -> Page:
     if example.message:
         page.write_labelled("Example", example.message)
         page.write_labelled("Action", example.remedy)
-    for label, finding_ids in {"Causes": causes, "Effects": find_effect_ids(name)}.items():
+    for label, text, finding_ids in (
+        ("Causes", f"Findings that can cause {name}", causes),
+        ("Effects", f"Findings that {name} can cause", find_effect_ids(name)),
+    ):
         if finding_ids:
-            page.write_labelled(label, ", ".join(finding_ids))
+            page.write_labelled(label, f"{text}: {', '.join(finding_ids)}")
     rate_sentences = [
         "The rates of false alarms and of detection have not been measured for this finding."
     ]

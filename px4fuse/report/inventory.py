@@ -28,15 +28,15 @@ def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
     if sender_rows:
         sender_head = ("sender", "type", "messages", "lost")
         page.add_table(sender_head, sender_rows, right_aligned_columns=(2, 3))
-    head = ("data", "topic", "samples", "rate", "gaps", "time span")
+    head = ("data", "topic", "", "", "", "")
     page.add_table(head, [*_make_source_rows(inventory)], right_aligned_columns=(2, 3, 4, 5))
-    possible = "possible", GOOD_COLOUR
-    impossible = "not possible", SEVERITY_COLOURS["warning"]
+    possible = "possible:", GOOD_COLOUR
+    impossible = "not possible:", SEVERITY_COLOURS["warning"]
     rows = [
         (possible if option.possible else impossible, option.name, option.reason)
         for option in inventory.abilities
     ]
-    page.add_table(("", "analysis", "data in the log"), rows)
+    page.add_table(("", "analysis", "data"), rows)
     if inventory.abilities[0].possible:  # comparison of KF and EKF2
         command = command_line(request, "compare", for_shell=True)
         page.add("command", text=command, label="Run")
@@ -94,14 +94,11 @@ def _describe_log(inventory: Inventory) -> Iterator[tuple[str, str]]:
 
 
 def _make_source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
-    previous_data_type = ""
     for source in inventory.sources:
-        data_type = source.part if source.part != previous_data_type else ""
-        previous_data_type = source.part
         yield (
-            f"{data_type:8} (used)" if source.chosen else data_type,
+            f"{source.part} (used)" if source.chosen else source.part,
             ("none", MUTED_COLOUR) if source.unavailable else source.name,
-            "" if source.samples is None else f"{source.samples}",
+            "" if source.samples is None else format_count(source.samples, "sample"),
             "" if source.rate_hz is None else f"{_format_for_narrow_column(source.rate_hz)} Hz",
             _format_gaps(source),
             _format_time_span(source),

@@ -132,7 +132,7 @@ def write_loop(page: Page, loop: Loop) -> None:
         }
     )
     missing_reasons = {
-        f"{correction.what}: {correction.reason}": None
+        f"No {correction.what}: {correction.reason}": None
         for correction in loop.corrections.values()
         if isinstance(correction, Unavailable)
     }
@@ -141,16 +141,18 @@ def write_loop(page: Page, loop: Loop) -> None:
     reference_names = [reference.name for reference in loop.references]
     head = [
         "path",
-        "position correction\nRMS / max (m)",
-        *(f"ATE against\n{reference_name} (m)" for reference_name in reference_names),
+        "position correction",
+        *(f"ATE against {reference_name}" for reference_name in reference_names),
     ]
     rows = []
     for path in loop.select_reported_paths():
         correction_text = "–"
         if path.correction_max_m:
-            correction_text = f"{path.correction_rms_m:.2f} / {path.correction_max_m:.2f}"
+            correction_text = (
+                f"correction {path.correction_rms_m:.2f} m RMS, {path.correction_max_m:.2f} m max"
+            )
         ate_texts = [
-            _format_error(evaluation.ate.translation_m, evaluation.ate.interval_m)
+            f"ATE {_format_error(evaluation.ate.translation_m, evaluation.ate.interval_m)}"
             if isinstance(evaluation := path.scores[reference_name], Evaluation)
             else "–"
             for reference_name in reference_names
@@ -170,17 +172,17 @@ def write_closures_and_rpe(page: Page, loop: Loop) -> None:
     for closure in loop.closures:
         cells = [
             _format_closure_times(closure, loop),
-            f"{closure.distance_m:.2f}",
-            f"{closure.d2:.1f}",
-            f"{closure.degrees_of_freedom}",
-            format_p_value(closure.p).removeprefix("p "),
+            f"closure error {closure.distance_m:.2f} m,",
+            f"d² {closure.d2:.1f},",
+            f"{closure.degrees_of_freedom} degrees of freedom,",
+            f"{format_p_value(closure.p)},",
             "accepted" if closure.accepted else "REJECTED",
-            "–" if closure.weight_gnc is None else f"{closure.weight_gnc:.2f}",
+            "" if closure.weight_gnc is None else f"GNC weight {closure.weight_gnc:.2f}",
         ]
         colour = TEXT_COLOUR if closure.accepted else ERROR_COLOUR
         rows.append([(cell, colour) for cell in cells])
     if rows:
-        head = ["closure", "distance\n(m)", "d²", "degrees of\nfreedom", "p", "gate", "GNC\nweight"]
+        head = ["loop closure", *[""] * 6]
         page.add_table(head, rows, right_aligned_columns=(1, 2, 3, 4, 6))
     for reference in loop.references:
         page.write_heading(f"RPE against {reference.name}")
@@ -191,12 +193,14 @@ def write_closures_and_rpe(page: Page, loop: Loop) -> None:
                 notes[score.reason] = None
                 continue
             if not rpe_rows:
-                head = ["path", *(f"{error.delta_text} (m)" for error in score.rpe), "rotation (°)"]
+                head = ["path", *[""] * (len(score.rpe) + 1)]
                 notes |= dict.fromkeys((describe_method(score), *score.notes, *score.warnings))
             rpe_texts = [
-                _format_error(error.translation_m, error.interval_m) for error in score.rpe
+                f"{error.delta_text}: {_format_error(error.translation_m, error.interval_m)}"
+                for error in score.rpe
             ]
-            rpe_rows.append([path.name, *rpe_texts, format_rmse(score.ate.rotation_deg, 2)])
+            rotation_text = f"rotation {format_rmse(score.ate.rotation_deg, 2)}°"
+            rpe_rows.append([f"RPE, {path.name}", *rpe_texts, rotation_text])
         if rpe_rows:
             page.add_table(head, rpe_rows)
         for note in notes:
@@ -225,7 +229,7 @@ def _describe_closure_error(loop: Loop) -> str:
         else f"heading error {heading_error_deg:+.1f}°"
     )
     return (
-        f"{error_m:.2f} m after {length_m:.1f} m ({error_m / length_m:.2%}): "
+        f"error {error_m:.2f} m after a path of {length_m:.1f} m ({error_m / length_m:.2%}): "
         f"{format_vector(error_components_m)}; {heading_text}"
     )
 
@@ -239,7 +243,7 @@ def _format_closure_times(closure: Closure, loop: Loop) -> str:
 
 def _format_error(errors_m: Statistics | Unavailable, interval: RmseInterval | Unavailable) -> str:
     interval_text = format_interval(interval)
-    return format_rmse(errors_m, 3) + (f" ({interval_text})" if interval_text else "")
+    return f"{format_rmse(errors_m, 3)} m" + (f" ({interval_text})" if interval_text else "")
 
 
 def make_pose_graph_page(graph: Graph) -> Page:

@@ -42,7 +42,7 @@ def format_settings(settings: Settings) -> str:
     setting_texts = (
         SETTING_RANGES[name].format_value(getattr(settings, name)) for name in KF_NUMERIC_SETTINGS
     )
-    return f"{', '.join(setting_texts)}, input {settings.input}{offset_text}"
+    return f"{', '.join(setting_texts)}, acceleration input {settings.input}{offset_text}"
 
 
 def format_sigma_verdict(verdict: str, factor: float) -> str:
@@ -66,13 +66,13 @@ def get_statistics_by_filter(result: AxisComparison) -> dict[str, FilterSummary 
     }
 
 
-VERDICT_TABLE_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")
+VERDICT_TABLE_HEAD = ("axis", "filter", "mean NIS", "95 % band", "verdict")
 
 
 def make_verdict_row(result: AxisComparison, name: str) -> list[Cell]:
     """Return the table row on the consistency of a filter along an axis."""
     consistency = get_statistics_by_filter(result)[name]
-    label = result.axis.label.removeprefix("the ") if name == "KF" else ""
+    label = result.axis.label.removeprefix("the ")
     if isinstance(consistency, Unavailable):
         return [label, name, "", "", ("not evaluated", MUTED_COLOUR)]
     is_consistent = consistency.verdict == "consistent"
@@ -93,7 +93,7 @@ def write_error_table(page: Page, analysis: Analysis) -> None:
                 *(_format_rms(consistency.truth, field) for field in RMSE_FIELDS),
             ]
             rows.append([*make_verdict_row(result, name), *cells])
-    head = [*VERDICT_TABLE_HEAD, "KF-EKF2\n(m)", "RMS\n(m/s)", "RMSE\n(m)", "\n(m/s)"]
+    head = [*VERDICT_TABLE_HEAD, "KF-EKF2 (m)", "(m/s)", "RMSE (m)", "(m/s)"]
     page.add_table(head, rows, right_aligned_columns=(2, 3, 5, 6, 7, 8))
 
 

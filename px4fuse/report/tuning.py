@@ -16,13 +16,16 @@ from px4fuse.report.phrases import format_noise_estimate, format_settings
 
 TUNING_HEAD = (
     "axis",
-    "SIGMA_A (m/s²)\nestimate (95 %)",
-    "SIGMA_Z (m)\nestimate (95 %)",
-    "log-likelihood\ngain (nats per\nmeasurement)",
-    "log-likelihood\ngain, 2nd half\nof the data",
-    "autocorrelation\nof innovations\n(lag 1), before\nand after tuning",
+    "SIGMA_A (m/s²), 95 %",
+    "SIGMA_Z (m), 95 %",
+    "log-likelihood gain",
+    "on 2nd half",
+    "lag-1 autocorrelation",
 )
-TUNING_NOTE = "Gain on the 2nd half: with SIGMA_A and SIGMA_Z estimated on the 1st half."
+TUNING_NOTE = (
+    "Log-likelihood gain in nats per measurement; on 2nd half: with the estimates of the 1st half. "
+    "Autocorrelation of the innovations before → after tuning."
+)
 
 
 def make_tuning_page(
@@ -39,7 +42,7 @@ def make_tuning_page(
             held_out_gain_text = f"{tuning.held_out.log_likelihood_gain_per_measurement:+.3f}"
         if not isinstance(tuning.before, Unavailable) and not isinstance(tuning.after, Unavailable):
             before, after = tuning.before.lag1_autocorrelation, tuning.after.lag1_autocorrelation
-            correlation_text = f"{before:+.2f} {after:+.2f}"
+            correlation_text = f"{before:+.2f} → {after:+.2f}"
         rows.append(
             [
                 name,
@@ -50,7 +53,7 @@ def make_tuning_page(
                 correlation_text,
             ]
         )
-    page.write_labelled("Chosen", format_settings(comparison.settings))
+    page.write_labelled("KF", format_settings(comparison.settings))
     if rows:
         page.add_table(TUNING_HEAD, rows, right_aligned_columns=(1, 2, 3, 4, 5))
         sentences.append(TUNING_NOTE)

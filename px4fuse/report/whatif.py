@@ -31,7 +31,7 @@ def make_column_headings(analysis: WhatIfAnalysis) -> list[str]:
     headings = ["logged", "replayed"]
     if change_texts:
         estimate_note = " (maximum-likelihood estimate)" if analysis.uses_estimates else ""
-        headings.append(f"replayed with {', '.join(change_texts)}{estimate_note}")
+        headings.append(f"changed: {', '.join(change_texts)}{estimate_note}")
     return headings
 
 
@@ -170,7 +170,7 @@ def make_whatif_page(analysis: WhatIfAnalysis) -> Page:
     spans_text = ", ".join(
         f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.evaluated_s
     )
-    page.write_labelled("Used", f"The statistics of all columns are for {spans_text}.")
+    page.write_labelled("Segment", f"{spans_text}, for all statistics")
     page.write_labelled("Replay", format_replay_agreement(whatif_result.agreement))
     if analysis.uses_estimates and not analysis.changes:
         no_change_text = (
@@ -179,7 +179,12 @@ def make_whatif_page(analysis: WhatIfAnalysis) -> Page:
         )
         page.write_labelled("Change", no_change_text)
     head = ["", *make_column_headings(analysis)]
-    page.add_table(head, make_statistic_rows(analysis), right_aligned_columns=range(1, len(head)))
+    names = ("", "logged ", "replayed ", "changed ")
+    rows = [
+        [f"{name}{cell}" for name, cell in zip(names, row, strict=False)]
+        for row in make_statistic_rows(analysis)
+    ]
+    page.add_table(head, rows, right_aligned_columns=range(1, len(head)))
     if select_sweep_summaries(analysis):
         page.add_table(*make_sweep_table(analysis), right_aligned_columns=range(1, 7))
     for line in describe_sweep(analysis):
