@@ -334,7 +334,7 @@ def test_time_offset_maximises_likelihood_sum_of_flight_parts(monkeypatch, offse
         measurement_weights=None,
     )
     parts, p = time_offset._estimate_flight_part_offsets(
-        moved, offset_s, NoiseParameters(0.1, 0.1), 1.0
+        moved, offset_s, NoiseParameters(0.1, 0.1), 1.0, 0.0
     )
     # the last part has a σ above the limit
     assert [(part.start_s, part.end_s) for part in parts] == [(0.0, 1.0), (2.0, 3.0), (4.0, 5.0)]
