@@ -274,7 +274,7 @@ def _gate_closures(
 ) -> tuple[Closure, ...]:
     """Test the loop closures against odometry with a χ² test."""
     edge_count = len(graph.first_nodes)
-    gate_results = gate_edges(graph, range(edge_count - len(closures), edge_count))
+    gate_results = gate_edges(graph, np.arange(edge_count - len(closures), edge_count))
     tested_closures: list[Closure] = []
     for closure, gate_result in zip(closures, gate_results, strict=True):
         error_m = graph.poses[gate_result.second, :3] - graph.poses[gate_result.first, :3]

@@ -51,11 +51,6 @@ class PoseGraph:
         edge_fields = ("first_nodes", "second_nodes", "measurements", "information")
         return replace(self, **{name: getattr(self, name)[is_selected] for name in edge_fields})
 
-    @property
-    def degrees_of_freedom(self) -> int:
-        """Degrees of freedom of a pose: 3 in the plane, 6 in space."""
-        return 3 if self.dimension == 2 else 6
-
     def find_successive_edges(self) -> BoolArray:
         """Return a mask of the edges between successive poses."""
         return np.asarray(np.abs(self.first_nodes - self.second_nodes) == 1)
@@ -123,8 +118,6 @@ def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
 
 def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> None:
     """Raise TrajectoryError if the used edges do not connect all poses of the graph."""
-    if not len(graph.first_nodes):
-        raise TrajectoryError("The pose graph has no edges", "Give a g2o file with EDGE lines.")
     is_informative = is_used & (np.trace(graph.information, axis1=1, axis2=2) > 0.0)
     connected_nodes = (graph.first_nodes[is_informative], graph.second_nodes[is_informative])
     node_count = len(graph)
