@@ -8,6 +8,7 @@ interval (sandwich estimate, White 1982).
 """
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -359,7 +360,7 @@ def _simulate_variance_increase_by_imu_noise(
     error_m = noise_parameters.sigma_z_m * draw_normal(measurement_count)
     # Velocity noise of the IMU: sum of the noise of Δv since the start of the segment
     velocity_noise = np.zeros_like(error_m)
-    for begin, end in positions_at_offset.segments:
+    for begin, end in pairwise(imu_motion.segment_edges.tolist()):
         np.cumsum(dv[..., begin : end - 1], axis=-1, out=velocity_noise[..., begin + 1 : end])
     # The random walk changes the positions, but not the velocity from the IMU
     if noise_parameters.random_walk_m:
@@ -421,11 +422,8 @@ def _estimate_flight_part_offsets(
     spline = CubicSpline(coarse_offsets_s, segment_scores_at_coarse_offsets, axis=1)
     part_offsets = []
     scores_above_minimum = []
-    for begin, end, scores in zip(
-        imu_motion.segment_edges,
-        imu_motion.segment_edges[1:],
-        spline(grid_offsets_s),
-        strict=False,
+    for (begin, end), scores in zip(
+        pairwise(imu_motion.segment_edges), spline(grid_offsets_s), strict=True
     ):
         part_offset_s, sigma_s = _fit_minimum_and_sigma(grid_offsets_s, scores)
         sigma_s *= float(np.sqrt(offset_variance_factor))
