@@ -5,11 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from px4fuse.trajectory.graph.model import (
-    PoseGraph,
-    assemble_normal_equations,
-    solve_normal_equations,
-)
+from px4fuse.trajectory.graph.normal_equations import NormalEquations
 
 
 def random_equations(poses: int, size: int, sides: int, closures: int) -> tuple:
@@ -23,11 +19,6 @@ def random_equations(poses: int, size: int, sides: int, closures: int) -> tuple:
     signs = np.array([-1.0, 1.0])[:, None, None, None]
     coefficients = signs * np.eye(size) + 0.05 * rng.normal(size=(2, count, size, size))
     return edges, *coefficients, root @ root.swapaxes(1, 2), rng.normal(size=(count, size, sides))
-
-
-def graph_with(edges: np.ndarray) -> PoseGraph:
-    empty = np.zeros(0)
-    return PoseGraph(3, np.arange(edges.max() + 1), empty, *edges, empty, empty)
 
 
 @pytest.mark.parametrize("closures", [0, 5, 300])
@@ -46,10 +37,9 @@ def test_sparse_solution_equals_solution_with_dense_matrices(
     right = weighted.T @ values.reshape(-1, sides)
     for damping in (0.0, 10.0):
         expected = np.linalg.solve(weighted.T @ dense + damping * np.eye(len(right)), right)
-        matrix, right_sides = assemble_normal_equations(
-            graph_with(edges), first, second, weights, values
-        )
-        solution = solve_normal_equations(matrix, right_sides, damping)
+        equations = NormalEquations(edges, size)
+        assembled, right_sides = equations.assemble(first, second, weights, values)
+        solution = equations.solve(assembled, right_sides, damping)
         assert not solution[0].any()
         np.testing.assert_allclose(
             solution[1:].reshape(-1, sides), expected, rtol=1e-7, atol=1e-9 * abs(expected).max()
@@ -60,5 +50,5 @@ def test_sparse_solution_equals_solution_with_dense_matrices(
 def test_solution_of_singular_matrix_is_none() -> None:
     edges, first, second, weights, values = random_equations(100, 3, 1, 5)
     weights[:] = 0.0
-    equations = assemble_normal_equations(graph_with(edges), first, second, weights, values)
-    assert solve_normal_equations(*equations) is None
+    equations = NormalEquations(edges, 3)
+    assert equations.solve(*equations.assemble(first, second, weights, values)) is None

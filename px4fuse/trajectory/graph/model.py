@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray
 from px4fuse.core.record import one_line_repr
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
+from px4fuse.trajectory.graph.normal_equations import NormalEquations
 
 # Directions with smaller eigenvalues of the information matrix (unit diagonal) are not measured
 MIN_EIGENVALUE_OF_OBSERVED_DIRECTION = 1e-9
@@ -50,6 +51,17 @@ class PoseGraph:
         """Return the graph with a selection of its edges."""
         edge_fields = ("first_nodes", "second_nodes", "measurements", "information")
         return replace(self, **{name: getattr(self, name)[is_selected] for name in edge_fields})
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Degrees of freedom of a pose: 3 in the plane, 6 in space."""
+        return 3 if self.dimension == 2 else 6
+
+    @cached_property
+    def normal_equations(self) -> NormalEquations:
+        """Normal equations of the poses, with the first pose fixed."""
+        edges = np.stack([self.first_nodes, self.second_nodes])
+        return NormalEquations(edges, self.degrees_of_freedom)
 
     def find_successive_edges(self) -> BoolArray:
         """Return a mask of the edges between successive poses."""
@@ -240,75 +252,20 @@ def _solve_positions(
     first_pose : ndarray, shape (d, k)
         Given value x_0 for the first pose.
     """
-    # The unknowns are the differences x_i - x_0
-    right_hand_side = right_hand_side - (first_pose_matrix + second_pose_matrix) @ first_pose
-    solution = solve_normal_equations(
-        *assemble_normal_equations(
-            graph, first_pose_matrix, second_pose_matrix, information, right_hand_side
-        )
+    edges = np.stack([graph.first_nodes, graph.second_nodes])
+    equations = NormalEquations(edges, len(first_pose))
+    fixed_first_pose = np.zeros((len(graph), *first_pose.shape))
+    fixed_first_pose[0] = first_pose
+    for pose_matrix, nodes in zip((first_pose_matrix, second_pose_matrix), edges, strict=True):
+        right_hand_side = right_hand_side - pose_matrix @ fixed_first_pose[nodes]
+    solution = equations.solve(
+        *equations.assemble(first_pose_matrix, second_pose_matrix, information, right_hand_side)
     )
     if solution is None:
         raise TrajectoryError(
             "The edges do not determine all initial poses", "Give VERTEX lines with initial poses."
         )
-    return first_pose + solution
-
-
-def assemble_normal_equations(
-    graph: PoseGraph,
-    first_pose_matrix: Array,
-    second_pose_matrix: Array,
-    information: Array,
-    right_hand_side: Array,
-) -> tuple[sparse.csc_array[np.float64], Array]:
-    """Assemble the normal equations of ``A x_i + B x_j = c`` over all edges (i, j), with x_0 = 0.
-
-    Return the matrix without the rows and columns of the first pose, and the right-hand sides of
-    all n poses, shape (n, d, k). The edges must connect all poses.
-
-    Parameters
-    ----------
-    first_pose_matrix, second_pose_matrix, information, right_hand_side : ndarray
-        A, B and weight, shape (m, d, d), and c, shape (m, d, k), of each of the m edges.
-    """
-    edge_count, d, _ = right_hand_side.shape
-    pose_matrices = np.stack([first_pose_matrix, second_pose_matrix], axis=1)
-    nodes = np.column_stack([graph.first_nodes, graph.second_nodes]).ravel()
-    jacobian, weighted_jacobian = (
-        sparse.bsr_array((matrices.reshape(-1, d, d), nodes, np.arange(0, len(nodes) + 1, 2)))
-        for matrices in (pose_matrices, information[:, None] @ pose_matrices)
-    )
-    matrix = (weighted_jacobian.T @ jacobian).tocsc()[d:, d:]
-    right_hand_sides = weighted_jacobian.T @ right_hand_side.reshape(edge_count * d, -1)
-    return matrix, right_hand_sides.reshape(len(graph), d, -1)
-
-
-def solve_normal_equations(
-    matrix: sparse.csc_array[np.float64], right_hand_sides: Array, damping: float = 0.0
-) -> Array | None:
-    """Solve normal equations of a pose graph, with damping added to the diagonal.
-
-    Return None if the matrix is not positive definite.
-    """
-    try:
-        factors = splu(
-            matrix + damping * sparse.eye_array(matrix.shape[0], format="csc"),
-            # This elimination order gives fewer nonzeros than the default COLAMD
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            # SuperLU must not merge columns with different nonzeros: it would then store zeros
-            relax=1,
-            panel_size=4,
-            options={"SymmetricMode": True},
-        )
-    except RuntimeError:  # singular matrix
-        return None
-    solution = np.zeros_like(right_hand_sides)
-    solution[1:] = factors.solve(right_hand_sides[1:].reshape(matrix.shape[0], -1)).reshape(
-        solution[1:].shape
-    )
-    is_positive_definite = np.all(factors.U.diagonal() > 0.0)
-    return solution if is_positive_definite and np.all(np.isfinite(solution)) else None
+    return fixed_first_pose + solution
 
 
 def _find_nearest_rotations(matrices: Array) -> Array:

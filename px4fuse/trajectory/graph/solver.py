@@ -149,8 +149,7 @@ def _minimise(
         first_pose_jacobian = second_pose_jacobian @ lie.adjoint(
             lie.inverse(residuals.relative_poses)
         )
-        matrix, gradient = model.assemble_normal_equations(
-            graph,
+        matrix_elements, gradient = graph.normal_equations.assemble(
             -first_pose_jacobian,
             second_pose_jacobian,
             weights[:, None, None] * graph.information,
@@ -160,7 +159,7 @@ def _minimise(
             cost_decrease = 0.0
             predicted_decrease = 0.0
             is_converged = False
-            step = model.solve_normal_equations(matrix, gradient, damping)
+            step = graph.normal_equations.solve(matrix_elements, gradient, damping)
             if step is not None:
                 predicted_decrease = 0.5 * float(np.sum(step * (damping * step + gradient)))
                 trial_residuals = model.residuals(
