@@ -7,7 +7,11 @@ from px4fuse.ekf2.inputs import FusionRules, ReplayInputs
 from px4fuse.ekf2.intervals import EventIntervals, StepEvents, make_event_intervals
 from px4fuse.ekf2.model import Ekf2Model, prepare_ekf2_model
 from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, ReplaySegment
-from px4fuse.flight.model import Flight
+from px4fuse.ekf2.steps import DifferenceExplanation, explain_difference_by_replacements
+from px4fuse.filter.kalman import run_kf
+from px4fuse.filter.settings import Settings
+from px4fuse.filter.signals import Segment, make_axes
+from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.trajectory.rotation import skew
 
 EYE = np.eye(15)
@@ -25,6 +29,16 @@ def opened(flight: Flight) -> Ekf2Model:
     found = prepare_ekf2_model(flight)
     assert isinstance(found, Ekf2Model), found
     return found
+
+
+def explained(model: Ekf2Model) -> dict[str, DifferenceExplanation] | Unavailable:
+    """Explain the difference between EKF2 and KF with the same position source."""
+    source = model.inputs.received_positions.source
+    track = next(track for track in model.flight.positions if track.name == source)
+    segment = Segment(0.0, model.flight.log.duration_s, "")
+    axes = make_axes(model.flight, track, segment, names=("north", "east"))
+    kf_runs = {axis.name: run_kf(axis, Settings(), fast=True) for axis in axes}
+    return explain_difference_by_replacements(model, Settings(), kf_runs)
 
 
 def intervals_of(model: Ekf2Model) -> EventIntervals:

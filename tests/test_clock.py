@@ -1,5 +1,6 @@
 """Time offset against simulated flights whose timestamps are wrong by a known amount."""
 
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -167,7 +168,8 @@ def test_integrated_constant_acceleration_equals_closed_form() -> None:
         np.flatnonzero(~positions.is_within_segment) + 1, moved.segment_edges[1:-1]
     )
     # positions are relative to the first measured one of each stretch
-    for begin, end in positions.segments:
+    edges = [*positions.segment_starts.tolist(), len(positions.measurement_m)]
+    for begin, end in pairwise(edges):
         known = positions.measurement_m[begin:end, 0]
         known = known[np.isfinite(known)]
         np.testing.assert_allclose(known, 0.25 * np.arange(len(known)), atol=1e-12)
@@ -334,7 +336,7 @@ def test_time_offset_maximises_likelihood_sum_of_flight_parts(monkeypatch, offse
         measurement_weights=None,
     )
     parts, p = time_offset._estimate_flight_part_offsets(
-        moved, offset_s, NoiseParameters(0.1, 0.1), 1.0
+        moved, offset_s, NoiseParameters(0.1, 0.1), 1.0, 0.0
     )
     # the last part has a σ above the limit
     assert [(part.start_s, part.end_s) for part in parts] == [(0.0, 1.0), (2.0, 3.0), (4.0, 5.0)]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from ekf2_tools import REPLACED_PROPERTIES, RULES, opened
+from ekf2_tools import REPLACED_PROPERTIES, RULES, explained, opened
 from exchange import replace
 from findings_tools import NONE, made
 from msgspec import structs
@@ -77,14 +77,14 @@ def test_what_if_is_unavailable_if_replay_differs_from_log(model):
     doubtful = replace(model, agreement=replace(model.agreement, good=False, reason="no reason"))
     for result in (
         what_if(doubtful, [{"EKF2_EVP_NOISE": 0.5}]),
-        explain_difference_by_replacements(doubtful),
+        explained(doubtful),
     ):
         assert isinstance(result, Unavailable)
         assert "no reason" in result.reason
 
 
 def test_contributions_to_kf_ekf2_difference_add_up_to_total(model):
-    for axis in explain_difference_by_replacements(model).values():
+    for axis in explained(model).values():
         assert axis.longest_rejection is None
         assert tuple(step.name for step in axis.steps) == REPLACED_PROPERTIES
         for quantity in ("position_mean_square_m2", "velocity_mean_square_m2_s2"):

@@ -174,7 +174,7 @@ def test_heading_error_is_estimated_for_all_parts_of_long_flight() -> None:
     """1,000 measurements in 25 minutes: fewer than three per part of ``FLIGHT_PART_DURATION_S``."""
     time = np.linspace(0.0, 1500.0, 1000)
     parts = frame_rotation._average_flight_parts(
-        time, np.radians(np.full(1000, 4.0)), np.radians(np.full(1000, 1.0))
+        time, np.radians(np.full(1000, 4.0)), np.radians(1.0)
     )
     assert len(parts) > 100
     assert parts[0].start_s == 0.0

@@ -228,7 +228,7 @@ def test_solve_invalid_pose_graph_gives_reason() -> None:
         (graph.select_edges((graph.second_nodes < 10) | (graph.first_nodes >= 10)),
          "2 disconnected parts: vertex 10 is not connected to"),
         (replace(graph, information=graph.information * 0.0), "30 disconnected parts"),
-        (graph.select_edges(np.zeros(len(graph.first_nodes), dtype=bool)), "has no edges"),
+        (graph.select_edges(np.zeros(len(graph.first_nodes), dtype=bool)), "30 disconnected parts"),
         (replace(graph, poses=poses), "not finite"),
     ):  # fmt: skip
         with pytest.raises(TrajectoryError, match=said):
@@ -382,7 +382,7 @@ def test_p_value_of_true_loop_closures_is_uniform(dimension, information, freedo
     edge = len(graph.first_nodes) - 1
     if information is not None:
         graph.information[edge] = information
-    found = [gate_edges(simulated(graph, seed), [edge])[0] for seed in range(300)]
+    found = [gate_edges(simulated(graph, seed), np.array([edge]))[0] for seed in range(300)]
     assert {each.degrees_of_freedom for each in found} == {freedom}
     assert kstest([each.p for each in found], "uniform").pvalue > 0.01
     assert np.mean([each.accepted for each in found]) > 0.995
@@ -415,7 +415,7 @@ def test_loop_closure_gate_distance_equals_gtsam(dimension: int, is_back: bool) 
             ]),
             information=np.concatenate([chain.information, 1e18 * np.eye(free)[None]]),
         )  # fmt: skip
-        found = gate_edges(closure, [len(chain.first_nodes)])[0]
+        found = gate_edges(closure, np.array([len(chain.first_nodes)]))[0]
         assert found.d2 == pytest.approx(off @ np.linalg.solve(covariance, off), rel=1e-4)
 
 
@@ -424,7 +424,7 @@ def test_loop_closure_gate_without_odometry_edge_raises_error() -> None:
     edge = len(graph.first_nodes) - 1
     gap = graph.select_edges(np.arange(len(graph.first_nodes)) != 10)
     with pytest.raises(TrajectoryError, match="no odometry edge connects vertices 10 and 11"):
-        gate_edges(gap, [edge - 1])
+        gate_edges(gap, np.array([edge - 1]))
     for at, direction, said in (
         (12, 2, "is singular"),
         (edge, slice(None), "its information matrix is zero"),
@@ -432,8 +432,8 @@ def test_loop_closure_gate_without_odometry_edge_raises_error() -> None:
         information = graph.information.copy()
         information[at, direction, :] = information[at, :, direction] = 0.0
         with pytest.raises(TrajectoryError, match=said):
-            gate_edges(replace(graph, information=information), [edge])
-    assert gate_edges(graph, []) == []
+            gate_edges(replace(graph, information=information), np.array([edge]))
+    assert gate_edges(graph, np.zeros(0, int)) == []
 
 
 def test_scaling_all_information_matrices_keeps_gate_results() -> None:

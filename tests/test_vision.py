@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from comparisons import compare
-from ekf2_tools import opened, step_matrix, step_noise, step_state
+from ekf2_tools import explained, opened, step_matrix, step_noise, step_state
 from exchange import replace
 
 from px4fuse.diagnose import diagnose_comparison, run_what_if
@@ -590,7 +590,7 @@ def test_ekf2_model_with_incomplete_vision_is_unavailable() -> None:
 
 
 def test_kf_ekf2_difference_is_partly_explained_by_vision() -> None:
-    found = steps.explain_difference_by_replacements(model())
+    found = explained(model())
     for why in found.values():
         names = [step.name for step in why.steps]
         assert (

@@ -223,7 +223,7 @@ def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
         yield UnmetCondition(
             "clock",
             "the timestamps are 0" if clock == "0" else f"the timestamps are in {clock}",
-            f"{EFFECT_BY_UNUSABLE_TIMESTAMP[clock]}",
+            EFFECT_BY_UNUSABLE_TIMESTAMP[clock],
             find_timestamp_action(clock),
         )
     if "age_s" not in status:

@@ -21,6 +21,7 @@ from px4fuse.ekf2.replay_segments import (
     find_replay_segments,
     read_prediction_step_s,
 )
+from px4fuse.filter.signals import interpolate_attitude
 from px4fuse.flight.ekf2_parameters import (
     AID_MASK_PARAMETER,
     AIDS,
@@ -50,7 +51,7 @@ from px4fuse.readers.common import find_flight_spans
 from px4fuse.readers.px4_innovations import has_fused_aid, replace_vision_by_gnss_innovations
 from px4fuse.readers.px4_positions import MAX_DOWNSAMPLED_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE_REMEDY
-from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, rotate, to_matrix
+from px4fuse.trajectory.rotation import conjugate, multiply, rotate, to_matrix
 
 ANALYSIS_NAME = "EKF2 replay"
 # Note in the log of a simulated flight
@@ -500,11 +501,7 @@ def read_vision(
                 "Send the positions in NED, or also send the orientation.",
             )
         ekf2_attitude, source_attitude = (
-            interpolate(
-                timestamp_s,
-                orientations.index.to_numpy(),
-                orientations[Columns.QUATERNION].to_numpy(),
-            )
+            interpolate_attitude(orientations, timestamp_s)
             for orientations in (attitude, track.orientation)
         )
         rotation = to_matrix(multiply(ekf2_attitude, conjugate(source_attitude)))

@@ -77,9 +77,6 @@ REPLAY_BATCH_SIZE = 10
 # Number of intervals between fusions whose states are computed at once; limits the memory
 EVENTS_PER_BLOCK = 512
 
-# Fields of Agreement whose names differ from PX4's name of the aiding source
-AGREEMENT_FIELD_BY_AID_NAME = {FLOW.name: "carried_difference_m"}
-
 
 @dataclass(frozen=True)
 class Ekf2Model:
@@ -152,7 +149,7 @@ def prepare_ekf2_model(
     # This replay omits some aiding sources. Their agreement with the log is from the earlier replay
     # that fused them
     failed_agreement_by_field = {
-        (field_name := AGREEMENT_FIELD_BY_AID_NAME.get(name, name)): getattr(
+        (field_name := "carried_difference_m" if name == FLOW.name else name): getattr(
             failed_agreement, field_name
         )
         for name, failed_agreement in failed_agreement_by_aid.items()

@@ -27,7 +27,6 @@ from px4fuse.ekf2.model import (
     replay_with_logged_rejections,
 )
 from px4fuse.ekf2.replay import (
-    HORIZONTAL_AXES,
     Ekf2Replay,
     compute_rmse_to_truth,
     interpolate_component,
@@ -157,23 +156,22 @@ class DifferenceExplanation(Record, kw_only=True):
 
 
 def explain_difference_by_replacements(
-    model: Ekf2Model, settings: Settings | None = None, kf_runs: Mapping[str, KfRun] | None = None
+    model: Ekf2Model, settings: Settings, kf_runs: Mapping[str, KfRun]
 ) -> dict[str, DifferenceExplanation] | Unavailable:
     """Explain the difference KF - EKF2 along each axis by replacing properties of KF.
 
     Parameters
     ----------
-    settings : Settings, optional
+    settings : Settings
         Settings of KF, with the time offset of the position source.
-    kf_runs : mapping from axis name to KfRun, optional
-        Results of KF by horizontal axis; default: north and east.
+    kf_runs : mapping from axis name to KfRun
+        Results of KF by horizontal axis.
     """
     if not model.agreement.good:
         return model.agreement.as_unavailable(DIFFERENCE_ANALYSIS_NAME)
-    kf_runs = kf_runs or {}
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    configurations = make_replacement_configurations(model.inputs, settings or Settings())
+    configurations = make_replacement_configurations(model.inputs, settings)
     # The last configuration is not run here: baseline_replay contains its track
     horizon_tracks = compute_delayed_tracks(model, [*configurations.values()][:-1])
     baseline_replay = replay_with_logged_rejections(model)
@@ -194,8 +192,6 @@ def explain_difference_by_replacements(
             "Analyse a segment in which EKF2 fused the position source (--start, --end).",
         )
     state_span_s = float(state_times_s[0]), float(state_times_s[-1])
-    directions = {name: run.axis.direction for name, run in kf_runs.items()}
-    directions = directions or dict(zip(HORIZONTAL_AXES, np.eye(3), strict=False))
     property_names = (*configurations, OUTPUT_PREDICTOR_PROPERTY)
     components_by_track = []
     # Tracks are computed one at a time, to limit the memory
@@ -207,10 +203,10 @@ def explain_difference_by_replacements(
         components_by_track.append(
             [
                 [
-                    interpolate_component(track, columns, direction, state_times_s)
+                    interpolate_component(track, columns, run.axis.direction, state_times_s)
                     for columns in (Columns.POSITION, Columns.VELOCITY)
                 ]
-                for direction in directions.values()
+                for run in kf_runs.values()
             ]
         )
         # Last replay that fuses every sample; the replays of the last two properties contain EKF2's
@@ -222,15 +218,13 @@ def explain_difference_by_replacements(
         baseline_replay, replay_track_without_gate, state_span_s, evaluated_spans
     )
     explanations = {}
-    for (axis, direction), axis_components in zip(
-        directions.items(), np.swapaxes(components_by_track, 0, 1), strict=True
+    for (axis, kf_run), axis_components in zip(
+        kf_runs.items(), np.swapaxes(components_by_track, 0, 1), strict=True
     ):
-        kf_state = axis_components[0]
-        if kf_runs:
-            kf_state = predict_track(kf_runs[axis], state_times_s)[STATE_COLUMNS].to_numpy().T
+        kf_state = predict_track(kf_run, state_times_s)[STATE_COLUMNS].to_numpy().T
         explanations[axis] = _explain_difference_along_axis(
             model.flight,
-            direction,
+            kf_run.axis.direction,
             property_names,
             state_times_s,
             np.array([kf_state, *axis_components]),

@@ -98,7 +98,7 @@ class VisionFilter:
     Attributes
     ----------
     update_records : ndarray, shape (events, k, 7, filters)
-        Rows of :func:`~px4fekf2.replay_segments.make_update_table` for each sample.
+        Rows of :func:`~px4fuse.ekf2.replay_segments.make_update_table` for each sample.
     position_reset_m : ndarray, shape (events, filters, 2)
         Change of the position by resets, north and east.
     last_fusion_s : ndarray, shape (filters,)

@@ -12,7 +12,7 @@ import pandas as pd
 from msgspec import structs
 from scipy.special import chdtrc
 
-from px4fuse.core.arrays import Array, compute_median_interval_s, rms
+from px4fuse.core.arrays import Array, compute_median_interval_s
 from px4fuse.core.record import NotNegative, Record, Share
 from px4fuse.filter.fitting import NoiseParameters, fit_constant_errors, maximise_likelihood
 from px4fuse.filter.imu_motion import (
@@ -181,9 +181,9 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
 
 
 def _average_flight_parts(
-    time_s: Array, misalignment_rad: Array, sigma_rad: Array
+    time_s: Array, misalignment_rad: Array, sigma_rad: float
 ) -> tuple[HeadingPart, ...]:
-    """Average yaw misalignment and σ (rad) over flight parts of equal duration.
+    """Average yaw misalignment (rad) over flight parts of equal duration.
 
     σ is not reduced by averaging, because errors in one part are correlated.
     """
@@ -204,7 +204,7 @@ def _average_flight_parts(
             start_s=float(time_s[part_rows[0]]),
             end_s=float(time_s[part_rows[-1]]),
             heading_error_deg=float(np.degrees(misalignment_rad[part_rows].mean())),
-            sigma_deg=float(np.degrees(rms(sigma_rad[part_rows]))),
+            sigma_deg=float(np.degrees(sigma_rad)),
         )
         for part_rows in rows_by_part
         if len(part_rows) >= MIN_FLIGHT_PART_SAMPLES
@@ -237,7 +237,7 @@ def _compare_orientations(
     misalignment_rad = misalignment_rad[has_low_yaw_rate]
     # Robust σ from the differences of successive samples
     noise_sigma_rad = 1.4826 * np.median(np.abs(np.diff(misalignment_rad))) / np.sqrt(2.0)
-    sigma_rad = np.full(len(time_s), max(float(noise_sigma_rad), np.radians(MIN_HEADING_SIGMA_DEG)))
+    sigma_rad = max(float(noise_sigma_rad), np.radians(MIN_HEADING_SIGMA_DEG))
     heading_parts = _average_flight_parts(time_s, misalignment_rad, sigma_rad)
     if len(heading_parts) < MIN_FLIGHT_PART_COUNT:
         return None
@@ -245,8 +245,7 @@ def _compare_orientations(
         [heading_part.heading_error_deg for heading_part in heading_parts]
     )
     chi_square = (
-        np.sum((heading_errors_deg - heading_errors_deg.mean()) ** 2)
-        / np.degrees(sigma_rad[0]) ** 2
+        np.sum((heading_errors_deg - heading_errors_deg.mean()) ** 2) / np.degrees(sigma_rad) ** 2
     )
     return combine_heading_parts(
         heading_parts, float(chdtrc(len(heading_parts) - 1, chi_square)), "orientation"

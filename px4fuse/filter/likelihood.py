@@ -172,36 +172,25 @@ def compute_gains(
 
     The result has the shape (3, m). They do not depend on the measured positions.
     """
-    q, r = sigma_a_m_s2 * sigma_a_m_s2, sigma_z_m * sigma_z_m
+    process_noise = (
+        sigma_a_m_s2 * sigma_a_m_s2 * preintegrated_motion.process_noise_per_sigma_a_squared
+        + preintegrated_motion.process_noise_independent_of_sigma_a
+    )
     covariance: SymmetricElements[float] = INITIAL_COVARIANCE
     variance_and_gains_by_measurement = []
-    for (
-        dt,
-        process_noise_per_sigma_a_squared,
-        process_noise_independent_of_sigma_a,
-        skips_update,
-    ) in zip(
+    for dt, (q00, q01, q11), skips_update in zip(
         preintegrated_motion.interval_s.tolist(),
-        preintegrated_motion.process_noise_per_sigma_a_squared.tolist(),
-        preintegrated_motion.process_noise_independent_of_sigma_a.tolist(),
+        process_noise.tolist(),
         [False] * len(preintegrated_motion.interval_s)
         if is_skipped is None
         else is_skipped.tolist(),
         strict=True,
     ):
         p00, p01, p11 = propagate_covariance(covariance, dt)  # P = FPFᵀ + Q
-        covariance = (
-            p00
-            + q * process_noise_per_sigma_a_squared[0]
-            + process_noise_independent_of_sigma_a[0],
-            p01
-            + q * process_noise_per_sigma_a_squared[1]
-            + process_noise_independent_of_sigma_a[1],
-            p11
-            + q * process_noise_per_sigma_a_squared[2]
-            + process_noise_independent_of_sigma_a[2],
+        covariance = p00 + q00, p01 + q01, p11 + q11
+        (_, s, k0, k1), (_, _, updated_covariance) = update_step(
+            0.0, 0.0, covariance, 0.0, sigma_z_m * sigma_z_m
         )
-        (_, s, k0, k1), (_, _, updated_covariance) = update_step(0.0, 0.0, covariance, 0.0, r)
         variance_and_gains_by_measurement.append((s, 0.0, 0.0) if skips_update else (s, k0, k1))
         covariance = covariance if skips_update else updated_covariance
     return np.array(variance_and_gains_by_measurement).T

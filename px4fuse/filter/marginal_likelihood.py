@@ -83,11 +83,6 @@ class PositionsAndIncrements:
     correlated_noise: tuple[float, float] | None = None
 
     @cached_property
-    def segments(self) -> list[tuple[int, int]]:
-        """Index of the first measurement of each segment, and of its last measurement plus 1."""
-        return list(pairwise([*self.segment_starts.tolist(), len(self.measurement_m)]))
-
-    @cached_property
     def is_within_segment(self) -> BoolArray:
         """True for each interval whose two measurements are in the same segment, shape (m - 1,)."""
         return ~np.isin(np.arange(1, len(self.measurement_m)), self.segment_starts)

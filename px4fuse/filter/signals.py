@@ -332,9 +332,7 @@ def integrate_ned_acceleration(
     if isinstance(acceleration, Unavailable):
         return acceleration
     time_s = acceleration.index.to_numpy()
-    segment_acceleration_m_s2 = rows_between(
-        acceleration, segment.start_s, segment.end_s
-    ).to_numpy()
+    segment_acceleration_m_s2 = cut_to_segment(acceleration, segment).to_numpy()
     if len(segment_acceleration_m_s2) < 2:
         return Unavailable(
             "IMU",

@@ -8,9 +8,9 @@ interval (sandwich estimate, White 1982).
 """
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
-from msgspec import structs
 from scipy.interpolate import CubicSpline
 from scipy.special import chdtrc
 
@@ -244,15 +244,15 @@ def estimate_time_offset(
             "data almost equally well. Possible causes: the flight has little acceleration, or the "
             "positions are noisy"
         )
+    applied_offset_s = settings.clock_offset_s
     parts: tuple[PartOffset, ...] = ()
     change_p_value = None
     if not rejection_reason:
         progress("change of the position source's time offset during the flight")
         parts, change_p_value = _estimate_flight_part_offsets(
-            imu_motion, offset_s, noise_parameters, offset_variance_factor
+            imu_motion, offset_s, noise_parameters, offset_variance_factor, applied_offset_s
         )
     drift_ppm, drift_sigma_ppm = _fit_clock_drift(parts)
-    applied_offset_s = settings.clock_offset_s
     return SourceTimeOffset(
         offset_s=applied_offset_s + offset_s,
         interval_s=(applied_offset_s + interval_low_s, applied_offset_s + interval_high_s),
@@ -262,9 +262,7 @@ def estimate_time_offset(
         reason=rejection_reason,
         curve_time_offsets_s=applied_offset_s + curve_time_offsets_s,
         curve_log_likelihood_drops=profile_scores - profile_scores.min(),
-        parts=tuple(
-            structs.replace(part, offset_s=applied_offset_s + part.offset_s) for part in parts
-        ),
+        parts=parts,
         drift_ppm=drift_ppm,
         drift_sigma_ppm=drift_sigma_ppm,
         change_p_value=change_p_value,
@@ -362,7 +360,7 @@ def _simulate_variance_increase_by_imu_noise(
     error_m = noise_parameters.sigma_z_m * draw_normal(measurement_count)
     # Velocity noise of the IMU: sum of the noise of Δv since the start of the segment
     velocity_noise = np.zeros_like(error_m)
-    for begin, end in positions_at_offset.segments:
+    for begin, end in pairwise(imu_motion.segment_edges.tolist()):
         np.cumsum(dv[..., begin : end - 1], axis=-1, out=velocity_noise[..., begin + 1 : end])
     # The random walk changes the positions, but not the velocity from the IMU
     if noise_parameters.random_walk_m:
@@ -404,10 +402,12 @@ def _estimate_flight_part_offsets(
     offset_s: float,
     noise_parameters: NoiseParameters,
     offset_variance_factor: float,
+    applied_offset_s: float,
 ) -> tuple[tuple[PartOffset, ...], float | None]:
     """Estimate the time offset of each flight segment, and test for a constant offset.
 
-    Return also the p-value of the test; None with fewer than two offsets.
+    ``applied_offset_s`` (s) is added to each offset. Return also the p-value of the test; None with
+    fewer than two offsets.
     """
     coarse_offsets_s = offset_s + PART_OFFSET_CHANGES_S
     coarse_offsets_s = coarse_offsets_s[np.abs(coarse_offsets_s) <= MAX_TESTED_TIME_OFFSET_S]
@@ -422,17 +422,16 @@ def _estimate_flight_part_offsets(
     spline = CubicSpline(coarse_offsets_s, segment_scores_at_coarse_offsets, axis=1)
     part_offsets = []
     scores_above_minimum = []
-    for begin, end, scores in zip(
-        imu_motion.segment_edges,
-        imu_motion.segment_edges[1:],
-        spline(grid_offsets_s),
-        strict=False,
+    for (begin, end), scores in zip(
+        pairwise(imu_motion.segment_edges), spline(grid_offsets_s), strict=True
     ):
         part_offset_s, sigma_s = _fit_minimum_and_sigma(grid_offsets_s, scores)
         sigma_s *= float(np.sqrt(offset_variance_factor))
         if sigma_s < MAX_SEGMENT_OFFSET_SIGMA_S:
             start_s, end_s = imu_motion.time_s[[begin, end - 1]].tolist()
-            part_offsets.append(PartOffset(start_s, end_s, part_offset_s, sigma_s))
+            part_offsets.append(
+                PartOffset(start_s, end_s, applied_offset_s + part_offset_s, sigma_s)
+            )
             scores_above_minimum.append(scores - scores.min())
     if len(part_offsets) < 2:
         return tuple(part_offsets), None

@@ -283,7 +283,7 @@ def tune_axes(
             "estimate SIGMA_Z",
             "Reduce the outliers of the positioning system.",
         )
-    sigma_a, sigma_z = (_estimate_noise(best_fit, noise_index) for noise_index in (0, 1))
+    sigma_a, sigma_z = _estimate_noises(best_fit)
     final_sigma_z_m = sigma_z.value_or_bound(best_fit.noise_parameters.sigma_z_m)
     kf_sigma_a = (
         sigma_a if imu_motion_fit is None else _estimate_kf_sigma_a(kf_fit, final_sigma_z_m)
@@ -312,24 +312,24 @@ def tune_axes(
     )
 
 
-def _estimate_noise(fit: NoiseFit, noise_index: int) -> NoiseEstimate:
-    """Return SIGMA_A (``noise_index`` 0) or SIGMA_Z (1) of a fit with its 95 % interval."""
-    best_parameters = fit.noise_parameters.sigma_a_m_s2, fit.noise_parameters.sigma_z_m
+def _estimate_noises(fit: NoiseFit) -> tuple[NoiseEstimate, NoiseEstimate]:
+    """Return SIGMA_A and SIGMA_Z of a fit with their 95 % intervals."""
+    best_parameters = fit.noise_parameters
+    log_sigma_a, log_sigma_z = np.log([best_parameters.sigma_a_m_s2, best_parameters.sigma_z_m])
 
-    def score(log_sigma: float, log_other_sigma: float) -> float:
-        log_parameters = (
-            (log_sigma, log_other_sigma) if noise_index == 0 else (log_other_sigma, log_sigma)
-        )
-        sigma_a, sigma_z = np.exp(log_parameters).tolist()
-        return fit.score(NoiseParameters(sigma_a, sigma_z, fit.noise_parameters.random_walk_m))
+    def score(tested_log_sigma_a: float, tested_log_sigma_z: float) -> float:
+        sigma_a, sigma_z = np.exp([tested_log_sigma_a, tested_log_sigma_z]).tolist()
+        return fit.score(NoiseParameters(sigma_a, sigma_z, best_parameters.random_walk_m))
 
-    search_range = (SIGMA_A_SEARCH_RANGE_M_S2, SIGMA_Z_SEARCH_RANGE_M)[noise_index]
-    variance_factor = (1.0, fit.log_sigma_z_variance_factor)[noise_index]
     return _make_noise_estimate(
-        score,
-        (np.log(best_parameters[noise_index]), np.log(best_parameters[1 - noise_index])),
-        search_range,
-        variance_factor,
+        score, (log_sigma_a, log_sigma_z), SIGMA_A_SEARCH_RANGE_M_S2
+    ), _make_noise_estimate(
+        lambda tested_log_sigma_z, tested_log_sigma_a: score(
+            tested_log_sigma_a, tested_log_sigma_z
+        ),
+        (log_sigma_z, log_sigma_a),
+        SIGMA_Z_SEARCH_RANGE_M,
+        fit.log_sigma_z_variance_factor,
     )
 
 

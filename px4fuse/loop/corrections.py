@@ -274,7 +274,7 @@ def _gate_closures(
 ) -> tuple[Closure, ...]:
     """Test the loop closures against odometry with a χ² test."""
     edge_count = len(graph.first_nodes)
-    gate_results = gate_edges(graph, range(edge_count - len(closures), edge_count))
+    gate_results = gate_edges(graph, np.arange(edge_count - len(closures), edge_count))
     tested_closures: list[Closure] = []
     for closure, gate_result in zip(closures, gate_results, strict=True):
         error_m = graph.poses[gate_result.second, :3] - graph.poses[gate_result.first, :3]
@@ -327,8 +327,7 @@ def solve_pose_graphs(
     else:
         progress(f"optimising: {CORRECTION_LABELS['pose_graph_gated']}")
         solution = solve(graph.select_edges(is_used))
-        corrected_path = _interpolate_corrections(path, node_indices, graph.poses, solution.poses)
-        corrections["pose_graph_gated"] = corrected_path, solution
+        corrections["pose_graph_gated"] = _correct_path(path, node_indices, graph.poses, solution)
     if len(closures) < 2:
         corrections["pose_graph_gnc"] = Unavailable(
             ROBUST_SOLUTION_LABEL,
@@ -338,8 +337,7 @@ def solve_pose_graphs(
     else:
         progress(f"optimising: {ROBUST_SOLUTION_LABEL}")
         solution = solve(graph, robust=True, is_closure=is_closure)
-        corrected_path = _interpolate_corrections(path, node_indices, graph.poses, solution.poses)
-        corrections["pose_graph_gnc"] = corrected_path, solution
+        corrections["pose_graph_gnc"] = _correct_path(path, node_indices, graph.poses, solution)
         closures = tuple(
             structs.replace(closure, weight_gnc=weight)
             for closure, weight in zip(closures, solution.weights[is_closure].tolist(), strict=True)
@@ -347,10 +345,11 @@ def solve_pose_graphs(
     return corrections, closures
 
 
-def _interpolate_corrections(
-    path: Trajectory, node_indices: IntArray, graph_poses: Array, solved_poses: Array
-) -> Trajectory:
+def _correct_path(
+    path: Trajectory, node_indices: IntArray, graph_poses: Array, solution: Solution
+) -> tuple[Trajectory, Solution]:
     """Correct each pose of a path by interpolation of the corrections of the graph nodes."""
+    solved_poses = solution.poses
     node_corrections = (
         Rotation.from_quat(solved_poses[:, 3:]) * Rotation.from_quat(graph_poses[:, 3:]).inv()
     )
@@ -365,7 +364,8 @@ def _interpolate_corrections(
     )
     position_m = (1.0 - next_node_weight[:, None]) * position_corrected_by_previous_node_m
     position_m += next_node_weight[:, None] * position_corrected_by_next_node_m
-    return path.replace_positions(position_m, Slerp(node_time_s, node_corrections)(time_s))
+    rotation = Slerp(node_time_s, node_corrections)(time_s)
+    return path.replace_positions(position_m, rotation), solution
 
 
 def score_paths(

@@ -1,7 +1,5 @@
 """Start, end and true final pose of a loop."""
 
-from dataclasses import replace
-
 import numpy as np
 from msgspec import structs
 from scipy.spatial.transform import Rotation
@@ -47,19 +45,17 @@ def cut_trajectory(trajectory: Trajectory, segment: Segment) -> Trajectory:
         )
     if segment.flight_span_s is None:
         return segment_track
-    position_m = segment_track.position_m.copy()
-    quaternions = None if segment_track.rotation is None else segment_track.rotation.as_quat()
+    # The selected poses are copies, so changes do not affect ``trajectory``
     for index, rest_start_s in ((0, segment.start_s - REST_DURATION_S), (-1, segment.end_s)):
         poses_at_rest = trajectory.cut_to_span(rest_start_s, rest_start_s + REST_DURATION_S)
         if not len(poses_at_rest):
             continue
         # If the vehicle moves, no mean is computed
         if compute_extent_m(poses_at_rest.position_m) <= MAX_POSITION_EXTENT_AT_REST_M:
-            position_m[index] = poses_at_rest.position_m.mean(axis=0)
-            if quaternions is not None and poses_at_rest.rotation is not None:
-                quaternions[index] = poses_at_rest.rotation.mean().as_quat()
-    rotation = None if quaternions is None else Rotation.from_quat(quaternions)
-    return replace(segment_track, position_m=position_m, rotation=rotation)
+            segment_track.position_m[index] = poses_at_rest.position_m.mean(axis=0)
+            if segment_track.rotation is not None and poses_at_rest.rotation is not None:
+                segment_track.rotation[index] = poses_at_rest.rotation.mean()
+    return segment_track
 
 
 def choose_loop_segment(

@@ -159,9 +159,8 @@ def _make_trajectory(
 
 def _read_reported_variances(samples: pd.DataFrame, columns: list[str]) -> Array | None:
     """Return reported variances, shape (n, 3), or None if values are missing."""
-    if not set(columns) <= set(samples.columns) or samples[columns].isna().to_numpy().any():
-        return None
-    return samples[columns].to_numpy(np.float64)
+    variances = samples.reindex(columns=columns).to_numpy(np.float64)
+    return None if np.isnan(variances).any() else variances
 
 
 @dataclass(frozen=True)

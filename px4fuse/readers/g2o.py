@@ -180,7 +180,7 @@ def format_g2o(graph: PoseGraph) -> str:
     """Write a pose graph as the text of a g2o file, with all digits of float64."""
     pose_type = "SE2" if graph.dimension == 2 else "SE3:QUAT"
     ids = graph.ids.tolist()
-    upper_triangle = np.triu_indices(graph.degrees_of_freedom)
+    upper_triangle = np.triu_indices(graph.information.shape[-1])
     lines = [
         f"VERTEX_{pose_type} {vertex_id} {' '.join(map(repr, pose))}"
         for vertex_id, pose in zip(ids, graph.poses.tolist(), strict=True)

@@ -77,9 +77,10 @@ def drop_constant_orientation(trajectory: Trajectory) -> tuple[Trajectory, tuple
 
 def find_frozen_poses(
     estimate: Trajectory, reference: Trajectory, time_offset_s: float
-) -> tuple[BoolArray, tuple[str, ...]]:
+) -> tuple[BoolArray, list[str]]:
     """Return a mask of repeated positions while the reference moves, and warnings."""
-    is_frozen, warnings = np.zeros(len(estimate), bool), []
+    is_frozen = np.zeros(len(estimate), bool)
+    warnings = []
     is_new_position = np.append(True, np.diff(estimate.position_m, axis=0).any(axis=1))
     new_position_indices = np.append(np.flatnonzero(is_new_position), len(estimate)).tolist()
     for start_index, end_index in pairwise(new_position_indices):
@@ -97,7 +98,7 @@ def find_frozen_poses(
                 f"its start, while the reference moves {motion_m:.1f} m. ATE and RPE exclude these "
                 f"poses ({(end_index - start_index) / len(estimate):.0%} of the estimate)."
             )
-    return is_frozen, tuple(warnings)
+    return is_frozen, warnings
 
 
 def find_jump_warnings(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:
@@ -252,7 +253,7 @@ def evaluate(
         estimate, reference, time_offset_s
     )
     added_offset_s = time_offset.offset_s or 0.0
-    is_frozen, frozen_warnings = find_frozen_poses(estimate, reference, added_offset_s)
+    is_frozen, warnings = find_frozen_poses(estimate, reference, added_offset_s)
     matched_estimate, matched_reference, association_result = associate(
         estimate[~is_frozen],
         reference,
@@ -266,18 +267,18 @@ def evaluate(
     fit_positions = partial(
         fit_alignment, matched_estimate.position_m, matched_reference.position_m, alignment
     )
-    line_motion_warnings = []
+    jump_warnings = find_jump_warnings(matched_estimate, matched_reference)
+    warnings += jump_warnings
     try:
         transform = fit_positions()
     except TrajectoryError as error:
         if is_alignment_given:
             raise
         transform = fit_positions(requires_motion=False)
-        line_motion_warnings.append(
+        warnings.append(
             f"{capitalise_first(error.reason)}. The ATE may be too small, and rotation errors may "
             "be wrong."
         )
-    jump_warnings = find_jump_warnings(matched_estimate, matched_reference)
     aligned_estimate, notes = _rotate_to_reference_body(
         _apply_transform(transform, matched_estimate), matched_reference
     )
@@ -289,9 +290,8 @@ def evaluate(
             matched_estimate.position_m, matched_reference.position_m, alignment
         )
         aligned_estimate = _apply_transform(transform, matched_estimate)
-    argument_order_warnings = []
     if estimate.kind == "truth" != reference.kind:
-        argument_order_warnings.append(
+        warnings.append(
             f"{estimate.name} is ground truth, but {reference.name} is not. Give the estimate "
             "first, then the reference."
         )
@@ -343,10 +343,7 @@ def evaluate(
         position_error_m=position_error_m,
         notes=(*estimate_notes, *reference_notes, *notes),
         warnings=(
-            *frozen_warnings,
-            *jump_warnings,
-            *line_motion_warnings,
-            *argument_order_warnings,
+            *warnings,
             *_find_mirror_warnings(
                 matched_estimate, matched_reference, alignment, position_statistics.rmse
             ),

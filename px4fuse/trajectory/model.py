@@ -153,8 +153,13 @@ class Trajectory:
         rotation = self.rotation
         if rotation is not None and world_rotation is not None:
             rotation = world_rotation * rotation
-        without_variances = replace(self, position_variance_m2=None, rotation_variance_rad2=None)
-        return replace(without_variances, position_m=position_m, rotation=rotation)
+        return replace(
+            self,
+            position_m=position_m,
+            rotation=rotation,
+            position_variance_m2=None,
+            rotation_variance_rad2=None,
+        )
 
     def describe_track(self) -> Track:
         """Return a summary of the trajectory for results.json."""

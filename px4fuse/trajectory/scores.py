@@ -255,17 +255,12 @@ def compute_relative_error(
         rotation_deg = rotations
     else:
         # with orientations, each displacement is in the axes of its first pose
-        start_rotation_inverses = [rotation[start_indices].inv() for rotation in rotations]
-        displacements_m = [
-            inverse.apply(displacement_m)
-            for inverse, displacement_m in zip(
-                start_rotation_inverses, displacements_m, strict=True
-            )
-        ]
-        estimated_rotation, reference_rotation = (
-            inverse * rotation[end_indices]
-            for inverse, rotation in zip(start_rotation_inverses, rotations, strict=True)
-        )
+        relative_rotations = []
+        for index, rotation in enumerate(rotations):
+            start_rotation_inverse = rotation[start_indices].inv()
+            displacements_m[index] = start_rotation_inverse.apply(displacements_m[index])
+            relative_rotations.append(start_rotation_inverse * rotation[end_indices])
+        estimated_rotation, reference_rotation = relative_rotations
         rotation_deg = compute_rotation_statistics(reference_rotation, estimated_rotation)
     # The difference between both displacements is as long as the translation of the pose error E of
     # the pair: a rotation does not change the length

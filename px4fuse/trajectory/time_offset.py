@@ -328,11 +328,8 @@ def _compute_interval_half_width_s(
         pose_count // 4,
     )
     lag_weights = 1.0 - np.arange(1, lag_count + 1) / (lag_count + 1.0)
-    lagged_products = [
-        float(likelihood_score[k:] @ likelihood_score[:-k]) for k in range(1, lag_count + 1)
-    ]
-    variance_if_uncorrelated = float(likelihood_score @ likelihood_score)
-    score_variance = variance_if_uncorrelated + max(2.0 * float(lag_weights @ lagged_products), 0.0)
+    variance_if_uncorrelated, *lagged_products = autocovariance(likelihood_score)[: lag_count + 1]
+    score_variance = variance_if_uncorrelated + max(2.0 * (lag_weights @ lagged_products), 0.0)
     student_t_quantile = float(stdtrit(max(pose_count / lag_count - 1.0, 1.0), 0.975))
     return float(student_t_quantile * np.sqrt(score_variance) / dense_square_sum)
 

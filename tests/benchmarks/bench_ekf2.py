@@ -33,7 +33,6 @@ from px4fuse.ekf2.steps import (
     REJECTION_PROPERTY,
     SAMPLE_TIMES_PROPERTY,
     TIMESTAMPS_PROPERTY,
-    explain_difference_by_replacements,
 )
 from px4fuse.ekf2.whatif import Ekf2Statistics, WhatIf, what_if
 from px4fuse.flight.model import Flight, Unavailable
@@ -104,6 +103,9 @@ def waterfalls(models: dict[str, Ekf2Model]) -> dict[str, float]:
 
     Returns the unexplained share of each flight.
     """
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    from ekf2_tools import explained
+
     unexplained = {}
     steps = (
         SAMPLE_TIMES_PROPERTY,
@@ -120,7 +122,7 @@ def waterfalls(models: dict[str, Ekf2Model]) -> dict[str, float]:
     )
     print("\nwhy EKF2 differs | total rms m | " + " | ".join(steps) + " | left")
     for name, model in models.items():
-        found = explain_difference_by_replacements(model)
+        found = explained(model)
         assert isinstance(found, dict), found
         axes, bars = found.values(), dict.fromkeys(steps, 0.0)
         total = sum(axis.position_mean_square_m2 for axis in axes)

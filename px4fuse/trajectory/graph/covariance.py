@@ -1,7 +1,5 @@
 """χ² test (gate) of loop closures against odometry."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from scipy.special import chdtrc
 
@@ -41,7 +39,7 @@ class GateResult(Record):
     accepted: bool
 
 
-def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -> list[GateResult]:
+def gate_edges(graph: model.PoseGraph, tested_edge_indices: IntArray) -> list[GateResult]:
     """Test loop closures against odometry with a χ² test of the squared Mahalanobis distance.
 
     Source of the covariance propagation: Barfoot 2017, eqs. 8.96 and 8.108.
@@ -51,7 +49,6 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
     TrajectoryError
         Odometry does not connect the poses of a closure, or has a singular information matrix.
     """
-    tested_edge_indices = np.asarray(edge_indices, dtype=np.intp)
     if not len(tested_edge_indices):
         return []
     odometry_edges = model.find_odometry_edges(graph, tested_edge_indices)

@@ -130,8 +130,6 @@ def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
 
 def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> None:
     """Raise TrajectoryError if the used edges do not connect all poses of the graph."""
-    if not len(graph.first_nodes):
-        raise TrajectoryError("The pose graph has no edges", "Give a g2o file with EDGE lines.")
     is_informative = is_used & (np.trace(graph.information, axis1=1, axis2=2) > 0.0)
     connected_nodes = (graph.first_nodes[is_informative], graph.second_nodes[is_informative])
     node_count = len(graph)

@@ -1,6 +1,5 @@
 """Pose graph optimisation by Levenberg-Marquardt, with robust rejection of false loop closures."""
 
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
@@ -35,6 +34,8 @@ _DAMPING_FACTOR = 10.0
 _MAX_DAMPING = 1e5
 # Minimum ratio of actual to predicted cost decrease of an accepted step, as in GTSAM
 _MIN_COST_DECREASE_RATIO = 1e-3
+# A smaller predicted decrease of the cost, relative to the cost, is a rounding error
+_MIN_RELATIVE_COST_DECREASE = 1e-13
 # Relative and absolute tolerance of the cost of a pose graph
 _COST_TOLERANCE = 1e-10
 # Relative tolerance of the cost in intermediate stages of graduated non-convexity
@@ -167,7 +168,7 @@ def _minimise(
                 cost_decrease = cost - float(np.sum(0.5 * weights * trial_residuals.chi2))
                 is_converged = abs(cost_decrease) < relative_cost_tolerance * cost
             is_accepted = (
-                predicted_decrease > sys.float_info.epsilon * cost
+                predicted_decrease > _MIN_RELATIVE_COST_DECREASE * cost
                 and cost_decrease > _MIN_COST_DECREASE_RATIO * predicted_decrease
             )
             if is_accepted or is_converged or damping >= _MAX_DAMPING:
