@@ -3,11 +3,13 @@
 import shlex
 from collections.abc import Iterable, Mapping
 from functools import reduce
+from itertools import groupby, product
 from typing import Any
 
 import pandas as pd
 
 from px4fuse.card.model import Card
+from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.record import Unavailable, read_csv
 from px4fuse.core.spreadsheet import neutralise_formulas
 from px4fuse.core.text import format_utc_time, replace_unencodable
@@ -21,7 +23,14 @@ STATUS_DONE, STATUS_NOT_COMPARED, STATUS_FAILED = "done", "not compared", "faile
 FINDING_SEPARATOR = ";"
 
 
-_COLUMN_DEFINITIONS = read_csv(__file__, dict[str, str], "columns.csv")
+# Rows of columns.csv; FILTER is replaced by the name of each filter
+_COLUMN_DEFINITIONS = [
+    {key: text.replace("FILTER", name) for key, text in row.items()}
+    for is_filter_column, rows in groupby(
+        read_csv(__file__, dict[str, str], "columns.csv"), lambda row: "FILTER" in row["column"]
+    )
+    for name, row in product(FILTER_NAMES if is_filter_column else [""], rows)
+]
 #: Path of each table column in the results, for example ``log.firmware``. The records "axis",
 #: "tuning" and "agreement" contain the results of one axis
 RESULT_PATH_BY_COLUMN = {row["column"]: row["path"] for row in _COLUMN_DEFINITIONS}
