@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from px4fuse.comparison.model import FilterName
+from px4fuse.comparison.model import FILTER_NAMES, FilterName
 from px4fuse.comparison.rerun_effects import Improvement
 from px4fuse.core.record import Count, NotNegative, PositiveFloat, Record, Share, Span
 from px4fuse.filter.consistency import Reference
@@ -63,6 +63,11 @@ class Verdict(Record, kw_only=True):
     is_explained: bool = False
 
     @property
+    def label(self) -> str:
+        """Label of the filter in the first of its two rows, else empty."""
+        return FILTER_NAMES[self.filter] if self.against == "source" else ""
+
+    @property
     def is_fault(self) -> bool:
         return self.word in ("overconfident", "underconfident") and not self.is_explained
 
@@ -75,9 +80,9 @@ class FlightErrors(Record, kw_only=True):
     axis : str
         Evaluated axis, for example "along the main axis, 30° from north".
     position_rmse_m : mapping
-        Position RMSE of "kf" and "ekf2" against ground truth along ``axis``.
+        Position RMSE of each filter against ground truth along ``axis``.
     horizontal_rmse_m : mapping
-        Horizontal position RMSE of "kf" and "ekf2" against ground truth.
+        Horizontal position RMSE of each filter against ground truth.
     difference_rms_m : float or None
         RMS of the position difference KF - EKF2 along ``axis``.
     rejected_fraction : float or None

@@ -21,7 +21,6 @@ from px4fuse.card.model import (
     Verdict,
     map_ratio_to_axis,
 )
-from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import convert_nested, format_metres, format_ratio
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS, Reference
 from px4fuse.finding import format_spans
@@ -378,8 +377,7 @@ def _format_verdict_lines(card: Card) -> Iterator[Paragraph]:
 
 
 def _format_verdict_line(verdict: Verdict) -> Paragraph:
-    filter_label = FILTER_NAMES[verdict.filter] if verdict.against == "source" else ""
-    label_text = f"  {filter_label:4} {QUANTITY_LABELS[verdict.against]:26}"
+    label_text = f"  {verdict.label:4} {QUANTITY_LABELS[verdict.against]:26}"
     if verdict.ratio is None:
         verdict_text = f"{'–':>6}  not evaluated: {verdict.reason}"
         return Paragraph(verdict_text, label_text, " " * 40)
