@@ -97,9 +97,9 @@ def test_info_sample_counts_match_those_of_compare(sample_flight):
     assert "external vision, position 2 Hz, " in ability(inventory, "aids").reason
     north = comparison.axes["north"]
     for name, samples in (
-        ("EKF2 states", north.ekf2_state),
-        ("EKF2 variances", north.ekf2_variance),
-        ("EKF2 consistency", north.ekf2_innovations),
+        ("EKF2 states", north.ekf2.state),
+        ("EKF2 variances", north.ekf2.variance),
+        ("EKF2 consistency", north.ekf2.innovations),
         ("error", north.truth),
     ):
         assert ability(inventory, name).reason.startswith(f"{len(samples)} ")
@@ -264,8 +264,8 @@ def test_info_lists_exactly_the_analyses_that_compare_performs(flight: Flight):
     assert ability(inventory, "compare").possible
     for name, part in (
         ("acceleration", north.axis.acceleration),
-        ("EKF2 states", north.ekf2_state),
-        ("EKF2 variances", north.ekf2_variance),
+        ("EKF2 states", north.ekf2.state),
+        ("EKF2 variances", north.ekf2.variance),
         ("EKF2 consistency", north.filters["ekf2"]),
         ("error", north.truth),
     ):

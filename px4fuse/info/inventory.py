@@ -11,7 +11,6 @@ from px4fuse.comparison.comparison import project_tracks
 from px4fuse.comparison.flight_events import compute_max_interval_s
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.preparation import prepare_comparison_inputs, select_source_innovations
-from px4fuse.comparison.projection import project_innovations
 from px4fuse.core.text import capitalise_first, format_utc_time, to_json_types
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.inputs import prepare_inputs
@@ -344,15 +343,8 @@ def _list_ekf2_and_truth_analyses(
         ]
     else:
         main_axis, segment = comparison.input_axes[0], comparison.segment
-        required_data = [
-            *project_tracks(ekf2, comparison.flight.truth, main_axis, segment).values()
-        ]
-        required_data.insert(
-            2,
-            ekf2
-            if isinstance(ekf2, Unavailable)
-            else project_innovations(flight, ekf2, comparison.source, main_axis, segment),
-        )
+        tracks, truth_table = project_tracks(comparison, ekf2, main_axis, segment)
+        required_data = [tracks.state, tracks.variance, tracks.innovations, truth_table]
     for (name, sample_text), data in zip(
         REQUIRED_SAMPLES_BY_ANALYSIS.items(), required_data, strict=True
     ):

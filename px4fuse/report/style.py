@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.arrays import Array
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ def dot_style(
     return {"color": colour, "marker": marker, "ms": size, "mew": edge_width, "ls": "none"}
 
 
+# Styles of each filter
 TRACK_STYLES = {
     "KF": line_style(KF_COLOUR, 1.0),
     "EKF2": line_style(EKF2_COLOUR, 1.1, (0, (4, 1.6))),
@@ -62,10 +64,12 @@ INNOVATION_STYLES = {
     "KF": dot_style(KF_COLOUR, "o", 2.0),
     "EKF2": dot_style(EKF2_COLOUR, "s", 2.2),
 }
+INNOVATION_SIGNS = {"KF": "●", "EKF2": "■"}  # in texts
+SIGMA_BAND_COLOURS = {"KF": KF_BAND_COLOUR, "EKF2": EKF2_BAND_COLOUR}
+FILTER_COLOURS = {name: TRACK_STYLES[label]["color"] for name, label in FILTER_NAMES.items()}
 # Rejected innovations of EKF2 are hollow
 REJECTED_STYLE = dot_style(EKF2_COLOUR, "s", 2.8, 0.6) | {"mfc": "white"}
 MEASUREMENT_STYLE = dot_style(MEASUREMENT_COLOUR, ".", 1.8)
-SIGMA_BAND_COLOURS = {"KF": KF_BAND_COLOUR, "EKF2": EKF2_BAND_COLOUR}
 
 MAX_DRAWN_POINTS = 1000  # maximum per curve
 
