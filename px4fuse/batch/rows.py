@@ -23,13 +23,13 @@ STATUS_DONE, STATUS_NOT_COMPARED, STATUS_FAILED = "done", "not compared", "faile
 FINDING_SEPARATOR = ";"
 
 
-# Rows of columns.csv; FILTER is replaced by the name of each filter
+# Rows of columns.csv; FILTER is replaced by each filter name, so rows without FILTER are repeated
 _COLUMN_DEFINITIONS = [
     {key: text.replace("FILTER", name) for key, text in row.items()}
-    for is_filter_column, rows in groupby(
+    for _, rows in groupby(
         read_csv(__file__, dict[str, str], "columns.csv"), lambda row: "FILTER" in row["column"]
     )
-    for name, row in product(FILTER_NAMES if is_filter_column else [""], rows)
+    for name, row in product(FILTER_NAMES, rows)
 ]
 #: Path of each table column in the results, for example ``log.firmware``. The records "axis",
 #: "tuning" and "agreement" contain the results of one axis

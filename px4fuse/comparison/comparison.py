@@ -21,6 +21,7 @@ from px4fuse.comparison.model import (
     PreparedComparison,
     UntestedFilter,
     UpdateStatistics,
+    select_north_and_east,
 )
 from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import HorizontalNis, assess_horizontal_nis
@@ -35,7 +36,6 @@ from px4fuse.flight.model import (
     sample_rate,
 )
 
-VARIANCE_COLUMNS = ("position_variance_m2", "velocity_variance_m2_s2")
 INNOVATION_COLUMNS = ["innovation_m", "innovation_variance_m2"]
 
 
@@ -56,15 +56,16 @@ def compare(prepared_comparison: PreparedComparison) -> Comparison:
         axis.name: _compare_axis(prepared_comparison, ekf2, axis, is_main=axis.name == main_name)
         for axis in prepared_comparison.input_axes
     }
-    horizontal_axes = [axes[name] for name in ("north", "east") if name in axes]
+    comparison = Comparison(
+        **vars(prepared_comparison) | {"notes": notes}, axes=axes, horizontal={}
+    )
+    north_and_east = select_north_and_east(comparison)
     horizontal_nis = {
         name: nis
         for name in FILTER_NAMES
-        if (nis := _assess_horizontal_innovations(axis.tracks[name] for axis in horizontal_axes))
+        if (nis := _assess_horizontal_innovations(axis.tracks[name] for axis in north_and_east))
     }
-    return Comparison(
-        **vars(prepared_comparison) | {"notes": notes}, axes=axes, horizontal=horizontal_nis
-    )
+    return replace(comparison, horizontal=horizontal_nis)
 
 
 def _compare_axis(
@@ -75,12 +76,6 @@ def _compare_axis(
     kf_run = run_kf(axis, prepared_comparison.settings, fast=not is_main)
     ekf2_tracks, truth = tracks_and_truth = project_tracks(prepared_comparison, ekf2, axis, segment)
     tracks: dict[FilterName, FilterTracks] = {"kf": make_run_tracks(kf_run), "ekf2": ekf2_tracks}
-    errors = {
-        name: compute_error_statistics(
-            *find_compared_track(each, ekf2_tracks.state), truth, each.fusion_horizon
-        )
-        for name, each in tracks.items()
-    }
     updates = kf_run.updates
     north, east, down = axis.direction.tolist()
     rejected_flags = _drop_missing_values(ekf2_tracks.innovations, "rejected")
@@ -95,7 +90,15 @@ def _compare_axis(
             rate_hz=sample_rate(updates) if len(updates) > 1 else None,
             input_gap_s=kf_run.input_gap_s,
         ),
-        filters={name: _summarise_filter(tracks[name], errors[name]) for name in tracks},
+        filters={
+            name: _summarise_filter(
+                each,
+                compute_error_statistics(
+                    *find_compared_track(each, ekf2_tracks.state), truth, each.fusion_horizon
+                ),
+            )
+            for name, each in tracks.items()
+        },
         difference=compute_difference_statistics(kf_run, ekf2_tracks.state),
         rejected_fraction=float(rejected_flags.mean()) if len(rejected_flags) else None,
         axis=axis,
@@ -120,20 +123,25 @@ def make_run_tracks(run: KfRun) -> FilterTracks:
 def project_tracks(
     prepared_comparison: PreparedComparison, ekf2: Ekf2 | Unavailable, axis: Axis, segment: Segment
 ) -> tuple[FilterTracks, TableOrUnavailable]:
-    """Project EKF2's state, variances and innovations, and ground truth, onto an axis."""
-    flight, source = prepared_comparison.flight, prepared_comparison.source
+    """Project EKF2 and ground truth onto an axis; innovations only in the analysed segment."""
     ekf2_tracks = (
         FilterTracks(ekf2, ekf2, ekf2)
         if isinstance(ekf2, Unavailable)
         else FilterTracks(
             projection.project(ekf2.state, axis, segment),
             projection.project_variance(ekf2, axis, segment),
-            projection.project_innovations(flight, ekf2, source, axis, segment),
+            projection.project_innovations(
+                prepared_comparison.flight,
+                ekf2,
+                prepared_comparison.source,
+                axis,
+                prepared_comparison.segment,
+            ),
             gate=ekf2.gate,
             fusion_horizon=projection.project_fusion_horizon_position(ekf2, axis, segment),
         )
     )
-    return ekf2_tracks, projection.project_truth(flight.truth, axis, segment)
+    return ekf2_tracks, projection.project_truth(prepared_comparison.flight.truth, axis, segment)
 
 
 def _summarise_filter(
@@ -223,7 +231,8 @@ def compute_error_statistics(
     if isinstance(truth, Unavailable):
         return truth
     position_m, velocity_m_s = (_compute_errors(state, truth, column) for column in STATE_COLUMNS)
-    if np.isfinite(position_m).sum() < projection.MIN_COMMON_SAMPLES:
+    count = int(np.isfinite(position_m).sum())
+    if count < projection.MIN_COMMON_SAMPLES:
         return Unavailable(
             "error against ground truth",
             "filter and ground truth do not overlap in time",
@@ -231,7 +240,10 @@ def compute_error_statistics(
         )
     nees_position, nees_velocity = (
         _compute_mean_nees(error / interpolate_sigma(state.index.to_numpy(), variance, column))
-        for error, column in zip((position_m, velocity_m_s), VARIANCE_COLUMNS, strict=True)
+        for error, column in (
+            (position_m, "position_variance_m2"),
+            (velocity_m_s, "velocity_variance_m2_s2"),
+        )
     )
     nees_at_horizon = None
     if fusion_horizon is not None:
@@ -240,7 +252,7 @@ def compute_error_statistics(
             _compute_errors(fusion_horizon, truth, "position_m") / sigma_m
         )
     return ErrorsAgainstTruth(
-        count=int(np.isfinite(position_m).sum()),
+        count=count,
         position_rmse_m=_compute_rmse(position_m),
         velocity_rmse_m_s=_compute_rmse(velocity_m_s) if np.isfinite(velocity_m_s).any() else None,
         nees_position_mean=nees_position,
@@ -282,9 +294,11 @@ def compute_position_errors(
     if isinstance(state, Unavailable):
         return state
     time_s = state.index.to_numpy()
-    errors_m = _compute_errors(state, axis_result.truth, STATE_COLUMNS[0])
-    sigma_m = interpolate_sigma(time_s, variance, VARIANCE_COLUMNS[0])
-    return pd.DataFrame({"error_m": errors_m, "sigma_m": sigma_m}, index=time_s)
+    errors_m = {
+        "error_m": _compute_errors(state, axis_result.truth, "position_m"),
+        "sigma_m": interpolate_sigma(time_s, variance, "position_variance_m2"),
+    }
+    return pd.DataFrame(errors_m, time_s)
 
 
 def compute_normalised_errors(

@@ -1,7 +1,7 @@
 """Inputs and results of a comparison of KF with EKF2."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import pandas as pd
@@ -160,7 +160,7 @@ class AxisComparison(Record, kw_only=True):
     rejected_fraction : float or None
         Fraction of the positions that EKF2 rejected; None if not logged.
     whole_flight_tracks : (FilterTracks, DataFrame or Unavailable)
-        EKF2 and ground truth over the whole flight.
+        EKF2 and ground truth over the whole flight, innovations only in the segment.
     """
 
     heading_deg: float | None = None
@@ -183,7 +183,6 @@ class AxisComparison(Record, kw_only=True):
     def with_whole_flight_tracks(self) -> "AxisComparison":
         """Return a copy with EKF2 and ground truth over the whole flight, for plots."""
         ekf2, truth = self.whole_flight_tracks
-        ekf2 = replace(ekf2, innovations=self.ekf2.innovations)
         return structs.replace(self, tracks={**self.tracks, "ekf2": ekf2}, truth=truth)
 
 

@@ -208,23 +208,24 @@ def _find_changes_to_test(
 
     ``ekf2_inputs`` is None for KF.
     """
-    summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
-    if not isinstance(summary, FilterSummary) or (
-        ekf2_inputs is not None and axis_result.axis.name == "down"
-    ):
+    axis, summary = (
+        axis_result.axis.name,
+        axis_result.filters["kf" if ekf2_inputs is None else "ekf2"],
+    )
+    if not isinstance(summary, FilterSummary) or (ekf2_inputs is not None and axis == "down"):
         return []  # EKF2's replay contains no vertical position
     statistics: list[Statistic] = ["nees"] if find_error_above_sigma(summary) else []
     if is_inconsistent(summary):
         statistics.append("nis")
     candidates = {
         statistic: find_candidate_changes(
-            comparison, estimates, ekf2_inputs, axis_result, statistic
+            comparison, estimates, ekf2_inputs, axis, summary, statistic
         )
         for statistic in statistics
     }
     changes = remove_repeated_changes(chain.from_iterable(candidates.values()))
     if axis_result is comparison.main:
-        changes = find_main_axis_changes(comparison, estimates, ekf2_inputs)
+        changes = find_main_axis_changes(comparison, estimates, ekf2_inputs, axis, summary)
     return [
         (change, tuple(statistic for statistic in statistics if change in candidates[statistic]))
         for change in changes
@@ -355,12 +356,12 @@ def _rerun_kf(
         measurement_time_s=time_s[is_used] + shift_s,
         measurement_m=axis.measurement_m[is_used],
     )
-    tracks = make_run_tracks(kf_run := run_kf(axis, changed_settings, fast=True))
+    kf_run = run_kf(axis, changed_settings, fast=True)
     # With a rotated frame, positions of KF and EKF2 are not comparable
     return _summarise_run(
         kf_run.updates["innovation_m"].to_numpy(),
         kf_run.updates["innovation_variance_m2"].to_numpy(),
-        compute_error_statistics(*find_compared_track(tracks, ekf2_state), truth),
+        compute_error_statistics(*find_compared_track(make_run_tracks(kf_run), ekf2_state), truth),
         None if rotates_gnss_positions else compute_difference_statistics(kf_run, ekf2_state),
     )
 

@@ -158,8 +158,9 @@ def _draw_histogram(axes: Axes, innovations: InnovationsByFilter) -> None:
 
 
 def _draw_autocorrelation(axes: Axes, innovations: InnovationsByFilter) -> None:
-    shifts = np.linspace(-0.18, 0.18, len(FILTER_NAMES))
-    for shift, (name, values) in zip(shifts, innovations.items(), strict=False):
+    for shift, (name, values) in zip(
+        np.linspace(-0.18, 0.18, len(FILTER_NAMES)), innovations.items(), strict=False
+    ):
         lag_count = min(MAX_AUTOCORRELATION_LAG, len(values) // 3)
         correlations = compute_autocorrelation(np.asarray(values, np.float64), lag_count)
         bar_lags = np.arange(1, lag_count + 1) + shift

@@ -247,8 +247,8 @@ def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
         errors = compute_position_errors(result, filter_name)
         if isinstance(errors, pd.DataFrame) and errors["error_m"].notna().any():
             rmse_m = effect.position_rmse_m.get(filter_name) if effect else None
-            title = f"{label} error (m): RMSE"
-            plots.append((title, rmse_m, errors["error_m"], {label: errors["sigma_m"]}))
+            sigmas_m = {label: errors["sigma_m"]}
+            plots.append((f"{label} error (m): RMSE", rmse_m, errors["error_m"], sigmas_m))
     if not plots and isinstance(result.ekf2.state, pd.DataFrame):
         time_s = result.ekf2.state.index.to_numpy()
         kf_track = predict_track(result.kf_run, time_s)
@@ -353,9 +353,11 @@ def _select_map_tracks(analysis: Analysis) -> dict[str, Array]:
 
     tracks = {"positions": cut_to_flight(analysis.source.samples)}
     for name, label in FILTER_NAMES.items():
-        runs = [run for result in results if (run := result.tracks[name].run)]
-        if len(runs) == 2:
-            tracks[label] = np.array([run.steps["position_m"] for run in runs])
+        positions_m = [
+            run.steps["position_m"] for result in results if (run := result.tracks[name].run)
+        ]
+        if len(positions_m) == 2:
+            tracks[label] = np.array(positions_m)
     if isinstance(flight.ekf2, Ekf2):
         tracks["EKF2"] = cut_to_flight(flight.ekf2.state)
     if isinstance(flight.truth, Truth):

@@ -45,7 +45,7 @@ def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
 
 def _draw_enlarged_sigma_plot(page: Page, result: AxisComparison) -> None:
     """Draw σ of position over a few updates."""
-    start_s, end_s = zoom_span_s = find_zoom_span(result)
+    start_s, end_s = find_zoom_span(result)
     title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
     axes = page.add_panel(title, ENLARGED_PLOT_HEIGHT, caption=_describe_sigma_at_updates(result))
     ekf2 = result.ekf2
@@ -65,7 +65,7 @@ def _draw_enlarged_sigma_plot(page: Page, result: AxisComparison) -> None:
     if isinstance(ekf2.variance, pd.DataFrame):
         logged_sigma_m = np.sqrt(ekf2.variance["position_variance_m2"].loc[start_s:end_s])
         axes.plot(logged_sigma_m, **style.dot_style(EKF2_COLOUR, "s", 3.0, 0.7), mfc="white")
-    axes.set_xlim(*zoom_span_s)
+    axes.set_xlim(start_s, end_s)
     axes.set_xlabel(style.TIME_LABEL)
     if isinstance(ekf2.state, pd.DataFrame):
         page.write_small_text("EKF2: ▵ before and ▿ after an update, □ logged σ.")
@@ -73,10 +73,8 @@ def _draw_enlarged_sigma_plot(page: Page, result: AxisComparison) -> None:
 
 def find_zoom_span(result: AxisComparison) -> Span:
     """Return the start and end (s) of a few updates in the middle of the flight."""
-    update_times_s = result.kf_run.updates.index.to_numpy()
-    centre_times_s = update_times_s
-    innovations = result.ekf2.innovations
-    if isinstance(innovations, pd.DataFrame) and len(innovations):
+    centre_times_s = update_times_s = result.kf_run.updates.index.to_numpy()
+    if isinstance(innovations := result.ekf2.innovations, pd.DataFrame) and len(innovations):
         centre_times_s = innovations.index.to_numpy()
     start_s = float(centre_times_s[len(centre_times_s) // 2])
     interval_s = np.median(np.diff(update_times_s)) if len(update_times_s) > 1 else 0.0

@@ -272,11 +272,11 @@ def _describe_errors(result: AxisComparison, quantity: QuantityColumns) -> str:
 def _find_innovation_limit_m(result: AxisComparison) -> float:
     limits_m = []
     for innovations in _collect_innovation_tables(result).values():
-        median_sqrt_s_m = float(np.sqrt(innovations["innovation_variance_m2"].median()))
+        median_sqrt_s_m = np.sqrt(innovations["innovation_variance_m2"].median())
         # a quantile, because outliers would enlarge the axis
-        quantile_m = float(np.quantile(innovations["innovation_m"].abs(), 0.99))
-        limits_in_sqrt_s = np.array([2.0, MAX_AXIS_LIMIT_IN_SQRT_S])
-        limits_m.append(float(np.clip(quantile_m, *limits_in_sqrt_s * median_sqrt_s_m)))
+        quantile_m = np.quantile(innovations["innovation_m"].abs(), 0.99)
+        highest_limit_m = MAX_AXIS_LIMIT_IN_SQRT_S * median_sqrt_s_m
+        limits_m.append(float(np.clip(quantile_m, 2.0 * median_sqrt_s_m, highest_limit_m)))
     return INNOVATION_AXIS_MARGIN_FACTOR * max(limits_m)
 
 

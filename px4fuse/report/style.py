@@ -28,7 +28,6 @@ TIME_LABEL = "time since first sample (s)"
 KF_COLOUR = "#12407f"
 KF_BAND_COLOUR = "#d0d9e6"
 EKF2_COLOUR = "#b85400"
-EKF2_BAND_COLOUR = "#f0dccd"
 TRUTH_COLOUR = "#111111"
 MEASUREMENT_COLOUR = "#9a9a9a"
 TEXT_COLOUR = "#000000"
@@ -65,7 +64,7 @@ INNOVATION_STYLES = {
     "EKF2": dot_style(EKF2_COLOUR, "s", 2.2),
 }
 INNOVATION_SIGNS = {"KF": "●", "EKF2": "■"}  # in texts
-SIGMA_BAND_COLOURS = {"KF": KF_BAND_COLOUR, "EKF2": EKF2_BAND_COLOUR}
+SIGMA_BAND_COLOURS = {"KF": KF_BAND_COLOUR, "EKF2": "#f0dccd"}
 FILTER_COLOURS = {name: TRACK_STYLES[label]["color"] for name, label in FILTER_NAMES.items()}
 # Rejected innovations of EKF2 are hollow
 REJECTED_STYLE = dot_style(EKF2_COLOUR, "s", 2.8, 0.6) | {"mfc": "white"}
