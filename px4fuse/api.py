@@ -136,7 +136,7 @@ def compare(
 
 
 def table(analysis: Analysis) -> pd.DataFrame:
-    """Return a table of the main numbers, with one row per axis and filter ("kf", "ekf2").
+    """Return a table of the main numbers, with one row per axis and filter.
 
     ``nis_low`` and ``nis_high`` are the 95 % band of the mean NIS. RMSE and NEES are against ground
     truth. Missing numbers are NaN.

@@ -11,7 +11,13 @@ import pandas as pd
 from exchange import replace
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import FILTER_NAMES, ErrorsAgainstTruth, FilterSummary, UntestedFilter
+from px4fuse.comparison.model import (
+    FILTER_NAMES,
+    ErrorsAgainstTruth,
+    FilterSummary,
+    FilterTracks,
+    UntestedFilter,
+)
 from px4fuse.comparison.rerun_effects import Rerun, RunStatistics
 from px4fuse.convention.correction import find_convention_faults
 from px4fuse.filter.consistency import Consistency
@@ -165,7 +171,12 @@ def analysis(
 
 def axis(name: str = "north", **parts: Any) -> Any:
     """Make the result of one axis; filters that are not given have no consistency test."""
-    usual = dict.fromkeys(("ekf2_innovations", "ekf2_state", "ekf2_variance", "truth"), NONE)
+    tracks = {
+        key: FilterTracks(
+            *(parts.pop(f"{key}_{kind}", NONE) for kind in ("state", "variance", "innovations"))
+        )
+        for key in FILTER_NAMES
+    }
     filters = {
         key: _with_truth(parts.pop(key, NONE), parts.pop(f"{key}_truth", NONE))
         for key in FILTER_NAMES
@@ -174,7 +185,9 @@ def axis(name: str = "north", **parts: Any) -> Any:
         name=name, label="the main axis" if name == "aisle" else name,
         measurement_time_s=np.arange(0.0, 120.0), measurement_m=np.zeros(120),
     )  # fmt: skip
-    return SimpleNamespace(axis=axis, filters=filters, **usual | parts)
+    return SimpleNamespace(
+        axis=axis, filters=filters, tracks=tracks, ekf2=tracks["ekf2"], **{"truth": NONE, **parts}
+    )
 
 
 def _with_truth(one: Any, truth: Any) -> Any:

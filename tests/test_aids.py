@@ -15,6 +15,7 @@ from pypdf import PdfReader
 from ulog_tools import gnss_log, seconds_of, stamps
 
 from px4fuse.analysis import AidingSourceAnalysis, find_failed_checks
+from px4fuse.comparison.model import FilterTracks
 from px4fuse.ekf2.aids import AidResult, evaluate_aids
 from px4fuse.errors import MissingDataError
 from px4fuse.findings import ekf2_fusion, ekf2_state, find_aid_findings
@@ -212,9 +213,11 @@ def test_height_error_in_gap_below_3_times_rmse_is_not_reported(
     time_s = np.arange(0.0, 60.0, 0.1)
     height_m = pd.Series(np.where(np.arange(600) % 2, 0.1, -0.1), time_s)
     height_m.loc[25.0:26.0] = error_m
+    not_logged = Unavailable("σ", "not logged", "")
+    ekf2 = FilterTracks(height_m.to_frame("position_m"), not_logged, not_logged)
     down = SimpleNamespace(
-        ekf2_state=height_m.to_frame("position_m"),
-        ekf2_variance=Unavailable("σ", "not logged", ""),
+        tracks={"ekf2": ekf2},
+        ekf2=ekf2,
         truth=pd.DataFrame({"position_m": 0.0}, index=time_s),
     )
     one = SimpleNamespace(axes={"down": down})

@@ -53,16 +53,20 @@ def test_time_without_positions_is_plotted_but_not_evaluated() -> None:
     for result, other in zip(whole.axes.values(), covered.axes.values(), strict=True):
         assert (result.filters, result.difference) == (other.filters, other.difference)
         shown = result.with_whole_flight_tracks()
-        for name in ("ekf2_state", "ekf2_variance", "truth"):
-            assert getattr(result, name).index[-1] <= 80.0
-            assert getattr(shown, name).index[-1] > 119.0
+        for table, shown_table in (
+            (result.ekf2.state, shown.ekf2.state),
+            (result.ekf2.variance, shown.ekf2.variance),
+            (result.truth, shown.truth),
+        ):
+            assert table.index[-1] <= 80.0
+            assert shown_table.index[-1] > 119.0
 
 
 def test_flight_events_list_rejections_per_axis() -> None:
     comparison = compare(aisle_flight(ekf2=Estimator(rejected_fraction=0.2)))
     found = collect_events(comparison)
     for result in comparison.axes.values():
-        frame = result.ekf2_innovations
+        frame = result.ekf2.innovations
         assert list(found.rejection_times_s[result.axis.name]) == list(
             frame.index[frame["rejected"] > 0]
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import os
 import re
 import shutil
@@ -31,7 +32,7 @@ EXTENSIONS = GUIDE.partition("## Extensions\n")[2].partition("\n**Changed texts"
 TABLES = [
     textwrap.dedent(block) for block in re.findall(r"```toml\n(.*?)```", EXTENSIONS, re.DOTALL)
 ]
-# A finding, a page and a command as short as the lists allow
+# A finding, a page, a command and a filter as short as the lists allow
 NEW_FILES = {
     "findings/wind.py": """
 from px4fuse.findings.model import make_note
@@ -56,8 +57,35 @@ def wind():
     \"\"\"Print the wind.\"\"\"
     click.echo("calm")
 """,
+    "filter/kf2.py": """
+from dataclasses import replace
+from px4fuse.filter.kalman import run_kf
+
+
+def run_kf2(axis, settings):
+    return run_kf(axis, replace(settings, sigma_a_m_s2=2.0 * settings.sigma_a_m_s2), fast=True)
+""",
 }
-CATALOGUE_ENTRY = '\n[wind]\ntitle = "Wind"\nmeaning = "Wind."\nreport_class = "noise"\n'
+# Replacements by file, for the third filter
+FILTER_CHANGES = {
+    "comparison/model.py": [
+        ('"kf", "ekf2"]', '"kf", "ekf2", "kf2"]'),
+        ('"ekf2": "EKF2"}', '"ekf2": "EKF2", "kf2": "KF2"}'),
+    ],
+    "comparison/comparison.py": [
+        ("import projection\n", "import projection\nfrom px4fuse.filter.kf2 import run_kf2\n"),
+        (
+            '"ekf2": ekf2_tracks}',
+            '"ekf2": ekf2_tracks,'
+            '"kf2": make_run_tracks(run_kf2(axis, prepared_comparison.settings))}',
+        ),
+    ],
+    "report/style.py": [(r'"EKF2": (.*?)(,\n|})', r'"EKF2": \1, "KF2": \1\2')],
+}
+CATALOGUE_ENTRIES = "".join(
+    f'\n[{name}]\ntitle = "Wind"\nmeaning = "Wind."\nreport_class = "noise"\n'
+    for name in ("wind", "kf2_overconfident", "kf2_underconfident")
+)
 CHECKS = {
     "ulog": """
 from pathlib import Path
@@ -99,6 +127,23 @@ draw_pages = PAGE_FUNCTIONS_BY_RESULTS_TYPE[ComparisonResults][-1]
 pages = list(draw_pages(None, None))
 assert "Wind page" in repr(pages[0].blocks)
 """,
+    "filter": """
+from comparisons import compare
+from flights import aisle_flight, unexplained
+from px4fuse.card.verdicts import make_sigma_verdicts
+from px4fuse.filter.settings import Settings
+from px4fuse.findings import find
+from px4fuse.report import consistency, flight
+analysis = unexplained(compare(aisle_flight(), Settings(sigma_z_m=0.01)))
+verdicts = make_sigma_verdicts(analysis.main)
+assert [each.word for each in verdicts if each.filter == "kf2"] == ["overconfident"] * 2
+assert "kf2_overconfident" in [each.id for each in find(analysis)]
+for draw_pages in (flight.draw_pages, flight.draw_innovations, consistency.draw_pages):
+    pages = list(draw_pages(analysis, None))
+    assert "KF2" in repr(pages[0].blocks)
+assert analysis.main.filters["kf2"].nis_mean < analysis.main.filters["kf"].nis_mean
+assert analysis.horizontal.keys() == {"kf", "ekf2", "kf2"}
+""",
     "command": """
 import sys
 from px4fuse.cli import cli
@@ -132,7 +177,7 @@ def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
         package / "findings" / "__init__.py",
         lambda text: text.replace("    source_values,\n", "    source_values,\n    wind,\n"),
     )
-    change(package / "findings" / "catalogue.toml", lambda text: text + CATALOGUE_ENTRY)
+    change(package / "findings" / "catalogue.toml", lambda text: text + CATALOGUE_ENTRIES)
     change(
         package / "report" / "pdf.py",
         lambda text: text.replace("    provenance,\n", "    provenance,\n    wind,\n").replace(
@@ -141,6 +186,9 @@ def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
             1,
         ),
     )
+    for name, replacements in FILTER_CHANGES.items():
+        for pattern, text in replacements:
+            change(package / name, functools.partial(re.sub, pattern, text))
     change(
         package / "cli" / "__init__.py",
         lambda text: text.replace("COMMANDS = (\n", 'COMMANDS = (\n    "wind",\n'),

@@ -1,7 +1,7 @@
 """Differences in settings, numbers and findings between two results (``px4fuse diff``).
 
 ``measures.csv`` lists the compared numbers: path in the results, label and unit. ``*`` in a path is
-any key, and ``KF_OR_EKF2`` the results of one filter along each axis.
+any key, and ``FILTER`` the results of one filter along each axis.
 """
 
 import math
@@ -49,11 +49,11 @@ Results = ComparisonResults | AidsResults
 COMPARED_NUMBER_DEFINITIONS = [
     row
     | {
-        "path": row["path"].replace("KF_OR_EKF2", f"axes.*.filters.{name}"),
-        "label": row["label"].replace("KF_OR_EKF2", label),
+        "path": row["path"].replace("FILTER", f"axes.*.filters.{name}"),
+        "label": row["label"].replace("FILTER", label),
     }
     for row in read_csv(__file__, dict[str, str], "measures.csv")
-    for name, label in (FILTER_NAMES.items() if "KF_OR_EKF2" in row["path"] else [("", "")])
+    for name, label in (FILTER_NAMES.items() if "FILTER" in row["path"] else [("", "")])
 ]
 # px4fuse diff lists a number only if its relative difference between A and B is larger than this
 MAX_OMITTED_RELATIVE_DIFFERENCE = 0.01
@@ -339,8 +339,8 @@ def _collect_nis_and_nees(results: Results) -> dict[str, tuple[float, bool]]:
     """Return each mean NIS and mean NEES by label, with True for a consistent filter."""
     mean_and_consistency_by_label: dict[str, tuple[float, bool]] = {}
     for axis, result in (find_value(results, "axes") or {}).items():
-        for name, label in FILTER_NAMES.items():
-            summary = result.filters[name]
+        for name, summary in result.filters.items():
+            label = FILTER_NAMES[name]
             if isinstance(summary, FilterSummary):
                 mean_and_consistency_by_label[f"Mean NIS of {label}, {axis}"] = (
                     summary.nis_mean,

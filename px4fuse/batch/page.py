@@ -144,12 +144,11 @@ def _make_log_cells(log: LogSummary) -> tuple[Cell, ...]:
 def _make_ratio_cell(ratio: float | None, column_name: str, verdict: str) -> Cell:
     if ratio is None:
         return Cell()
-    filter_name, _, reference_name = column_name.partition("_")
     emphasis_css_class = " loud" if verdict in ("overconfident", "underconfident") else ""
     return Cell(
         format_ratio(ratio),
         ratio,
-        style_class=f"{filter_name} {reference_name}{emphasis_css_class}",
+        style_class=column_name.replace("_", " ") + emphasis_css_class,
     )
 
 

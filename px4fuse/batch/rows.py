@@ -3,11 +3,13 @@
 import shlex
 from collections.abc import Iterable, Mapping
 from functools import reduce
+from itertools import groupby, product
 from typing import Any
 
 import pandas as pd
 
 from px4fuse.card.model import Card
+from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.record import Unavailable, read_csv
 from px4fuse.core.text import format_utc_time, neutralise_formulas, replace_unencodable
 from px4fuse.ekf2.aids import AidResult
@@ -20,7 +22,14 @@ STATUS_DONE, STATUS_NOT_COMPARED, STATUS_FAILED = "done", "not compared", "faile
 FINDING_SEPARATOR = ";"
 
 
-_COLUMN_DEFINITIONS = read_csv(__file__, dict[str, str], "columns.csv")
+# Rows of columns.csv; FILTER is replaced by each filter name, so rows without FILTER are repeated
+_COLUMN_DEFINITIONS = [
+    {key: text.replace("FILTER", name) for key, text in row.items()}
+    for _, rows in groupby(
+        read_csv(__file__, dict[str, str], "columns.csv"), lambda row: "FILTER" in row["column"]
+    )
+    for name, row in product(FILTER_NAMES, rows)
+]
 #: Path of each table column in the results, for example ``log.firmware``. A path that begins with
 #: "axis", "tuning" or "agreement" refers to the results of the axis of the table row
 RESULT_PATH_BY_COLUMN = {row["column"]: row["path"] for row in _COLUMN_DEFINITIONS}

@@ -447,15 +447,19 @@ def _explain_verdict_differences(
     """
     may_drift, ekf2_errors = analysis.source.origin.may_drift, analysis.main.filters["ekf2"].truth
     sigma_verdicts = _mark_explained_verdicts(sigma_verdicts, causes, may_drift=may_drift)
-    *previous_verdicts, ekf2_verdict = sigma_verdicts
     horizon_nees = getattr(ekf2_errors, "nees_position_horizon_mean", None)
     horizon_sigma_ratio = math.sqrt(horizon_nees or math.inf)
+    # The second verdict on EKF2 is against ground truth
+    *_, ekf2_verdict = (verdict for verdict in sigma_verdicts if verdict.filter == "ekf2")
     if (
         not causes
         and ekf2_verdict.word == "overconfident"
         and classify_sigma_ratio(horizon_sigma_ratio, "truth") == "consistent"
     ):
-        return (*previous_verdicts, replace(ekf2_verdict, is_explained=True)), (
+        return tuple(
+            replace(verdict, is_explained=True) if verdict is ekf2_verdict else verdict
+            for verdict in sigma_verdicts
+        ), (
             "EKF2 reports σ for its delayed position at the fusion horizon. The error of the "
             f"delayed position is {format_ratio(horizon_sigma_ratio)} times σ, so EKF2 is "
             "consistent. The output predictor adds a lag error to the published position."

@@ -9,7 +9,7 @@ from msgspec import structs
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import Action, ActionTarget, CardRerun, DiagnosedCause, Verdict
 from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z
-from px4fuse.comparison.model import FILTER_NAMES, FilterName
+from px4fuse.comparison.model import FilterName
 from px4fuse.comparison.remedy import make_delay_change, select_changed_settings
 from px4fuse.comparison.rerun_effects import (
     OUTLIERS_KEY,
@@ -40,6 +40,8 @@ CHANGE_KINDS_VISIBLE_ONLY_IN_TRUTH = frozenset({"time offset", "delay", "rotatio
 REBOOT_PARAMETER_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
 # The table of re-runs shows the fraction of rejected positions if it is at least this value
 MIN_REJECTED_FRACTION_TO_SHOW = 0.005
+# Filters whose settings the user can change
+TARGET_BY_ADJUSTABLE_FILTER: Mapping[FilterName, ActionTarget] = {"kf": "KF", "ekf2": "EKF2"}
 # Device or filter that the user must change, by group of the finding
 ACTION_TARGET_BY_GROUP: Mapping[str, ActionTarget] = {
     "position source": "sender",
@@ -239,10 +241,10 @@ def _make_actions(
     action_targets = {
         action.target for group in (actions, *alternative_action_groups) for action in group
     }
-    reason_by_filter: dict[ActionTarget, str] = {
-        name: reason
-        for filter_name, name in FILTER_NAMES.items()
-        if name not in action_targets
+    reason_by_filter = {
+        target: reason
+        for filter_name, target in TARGET_BY_ADJUSTABLE_FILTER.items()
+        if target not in action_targets
         and (reason := _explain_missing_action(finding, filter_name, sigma_verdicts))
     }
     if len(reason_by_filter) == 2 and len(set(reason_by_filter.values())) == 1:
@@ -314,7 +316,9 @@ def _find_action_target(finding: Finding, source: PositionTrack | None = None) -
     target = ACTION_TARGET_BY_FINDING_ID.get(finding.id) or ACTION_TARGET_BY_GROUP[group]
     is_ekf2_parameter_set = finding.remedy.startswith(("Set EKF2_", "Check EKF2_"))
     is_ekf2_error_only = (
-        finding.id == "error_exceeds_reported_sigma" and "kf_sigma_p_m" not in finding.evidence
+        finding.id == "error_exceeds_reported_sigma"
+        and finding.evidence.get("filter") == "ekf2"
+        and "kf_sigma_p_m" not in finding.evidence
     )
     if (target == "sender" and is_ekf2_parameter_set) or is_ekf2_error_only:
         target = "EKF2"
@@ -355,7 +359,7 @@ def _make_card_rerun(rerun: Rerun) -> CardRerun:
 
 def _format_rerun_label(rerun: Rerun) -> str:
     kind = rerun.kinds[0]
-    label = FILTER_NAMES[rerun.filter] + " (replay)" * (rerun.filter == "ekf2")
+    label = TARGET_BY_ADJUSTABLE_FILTER[rerun.filter] + " (replay)" * (rerun.filter == "ekf2")
     if OUTLIERS_KEY in rerun.change:
         return f"{label} without {rerun.change[OUTLIERS_KEY]:.0f} outliers"
     if kind == "time offset":

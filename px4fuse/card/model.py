@@ -75,9 +75,9 @@ class FlightErrors(Record, kw_only=True):
     axis : str
         Evaluated axis, for example "along the main axis, 30° from north".
     position_rmse_m : mapping
-        Position RMSE of "kf" and "ekf2" against ground truth along ``axis``.
+        Position RMSE of each filter against ground truth along ``axis``.
     horizontal_rmse_m : mapping
-        Horizontal position RMSE of "kf" and "ekf2" against ground truth.
+        Horizontal position RMSE of each filter against ground truth.
     difference_rms_m : float or None
         RMS of the position difference KF - EKF2 along ``axis``.
     rejected_fraction : float or None

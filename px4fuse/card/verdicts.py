@@ -44,10 +44,10 @@ def _assess_against_source(result: AxisComparison, filter_name: FilterName) -> V
 
 
 def _assess_against_truth(result: AxisComparison, filter_name: FilterName) -> Verdict:
-    errors_against_truth = result.filters[filter_name].truth
-    if isinstance(errors_against_truth, Unavailable):
-        return _make_unevaluated_verdict(filter_name, "truth", errors_against_truth)
-    errors = compute_normalised_errors(result, filter_name)
+    truth = result.filters[filter_name].truth
+    errors = (
+        truth if isinstance(truth, Unavailable) else compute_normalised_errors(result, filter_name)
+    )
     if isinstance(errors, Unavailable):
         return _make_unevaluated_verdict(filter_name, "truth", errors)
     time_s, normalised_errors = errors

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from px4fuse.comparison.estimates import Estimates, TuningByAxis, find_first_tuning
-from px4fuse.comparison.model import AxisComparison, Comparison, FilterSummary
+from px4fuse.comparison.model import Comparison, FilterSummary
 from px4fuse.comparison.remedy import (
     make_delay_max_change,
     make_estimated_delay_change,
@@ -66,14 +66,13 @@ def find_candidate_changes(
     comparison: Comparison,
     estimates: Estimates,
     ekf2_inputs: ReplayInputs | None,
-    axis_result: AxisComparison,
+    axis: str,
+    summary: FilterSummary,
     statistic: Statistic,
 ) -> list[Change]:
     """Return the changes of settings or data that may correct the mean NIS or NEES of a filter."""
-    summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
-    assert isinstance(summary, FilterSummary)  # an UntestedFilter has no mean NIS or NEES
     is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
-    axis_tuning = find_axis_tuning(estimates.tuning, axis_result.axis.name)
+    axis_tuning = find_axis_tuning(estimates.tuning, axis)
     changes = list[Change]()
     # Do not reduce the noise settings for GNSS or odometry: innovations do not show the slow errors
     # of these sources, only ground truth does
@@ -93,7 +92,7 @@ def find_candidate_changes(
         comparison, ekf2_inputs, estimates.time_offset
     )
     changes += [delay_change] if delay_change else _find_offset_changes(estimates, ekf2_inputs)
-    if axis_result.axis.name == "down":
+    if axis == "down":
         return changes
     if (
         isinstance(heading := estimates.heading, HeadingError)
@@ -109,14 +108,18 @@ def find_candidate_changes(
 
 
 def find_main_axis_changes(
-    comparison: Comparison, estimates: Estimates, ekf2_inputs: ReplayInputs | None
+    comparison: Comparison,
+    estimates: Estimates,
+    ekf2_inputs: ReplayInputs | None,
+    axis: str,
+    summary: FilterSummary,
 ) -> list[Change]:
     """Return the changes of settings or data for re-runs along the main axis."""
     changes = remove_repeated_changes(
         change
         for statistic in CONSISTENCY_STATISTICS[::-1]
         for change in find_candidate_changes(
-            comparison, estimates, ekf2_inputs, comparison.main, statistic
+            comparison, estimates, ekf2_inputs, axis, summary, statistic
         )
     )
     if ekf2_inputs is not None:

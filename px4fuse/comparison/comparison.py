@@ -1,5 +1,6 @@
 """Comparison of KF, EKF2 and ground truth along each axis."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -9,18 +10,21 @@ from msgspec import structs
 
 from px4fuse.comparison import projection
 from px4fuse.comparison.model import (
+    FILTER_NAMES,
     AxisComparison,
     Comparison,
     Difference,
     ErrorsAgainstTruth,
     FilterName,
     FilterSummary,
+    FilterTracks,
     PreparedComparison,
     UntestedFilter,
     UpdateStatistics,
+    select_north_and_east,
 )
 from px4fuse.core.arrays import Array
-from px4fuse.filter.consistency import DEFAULT_GATE, HorizontalNis, assess_horizontal_nis
+from px4fuse.filter.consistency import HorizontalNis, assess_horizontal_nis
 from px4fuse.filter.kalman import KfRun, predict_track, run_kf
 from px4fuse.filter.model import STATE_COLUMNS
 from px4fuse.filter.signals import AISLE, Axis, Segment
@@ -28,12 +32,10 @@ from px4fuse.flight.model import (
     RECORD_NOT_LOGGED,
     Ekf2,
     TableOrUnavailable,
-    Truth,
     Unavailable,
     sample_rate,
 )
 
-VARIANCE_COLUMNS = ("position_variance_m2", "velocity_variance_m2_s2")
 INNOVATION_COLUMNS = ["innovation_m", "innovation_variance_m2"]
 
 
@@ -55,51 +57,29 @@ def compare(prepared_comparison: PreparedComparison) -> Comparison:
         axis.name: _compare_axis(prepared_comparison, ekf2, axis, is_main=axis.name == main_name)
         for axis in prepared_comparison.input_axes
     }
-    horizontal_axes = [axes[name] for name in ("north", "east") if name in axes]
-    innovations: dict[FilterName, list[TableOrUnavailable]] = {
-        "kf": [axis.kf_run.updates for axis in horizontal_axes],
-        "ekf2": [axis.ekf2_innovations for axis in horizontal_axes],
-    }
+    comparison = Comparison(
+        **vars(prepared_comparison) | {"notes": notes}, axes=axes, horizontal={}
+    )
+    north_and_east = select_north_and_east(comparison)
     horizontal_nis = {
         name: nis
-        for name, tables in innovations.items()
-        if (nis := _assess_horizontal_innovations(tables))
+        for name in FILTER_NAMES
+        if (nis := _assess_horizontal_innovations(axis.tracks[name] for axis in north_and_east))
     }
-    return Comparison(
-        **vars(prepared_comparison) | {"notes": notes}, axes=axes, horizontal=horizontal_nis
-    )
+    return replace(comparison, horizontal=horizontal_nis)
 
 
 def _compare_axis(
     prepared_comparison: PreparedComparison, ekf2: Ekf2 | Unavailable, axis: Axis, *, is_main: bool
 ) -> AxisComparison:
-    segment, flight = prepared_comparison.segment, prepared_comparison.flight
+    segment = prepared_comparison.segment
     # Only the main axis, which the report shows step by step, needs filterpy
     kf_run = run_kf(axis, prepared_comparison.settings, fast=not is_main)
-    tracks = project_tracks(ekf2, flight.truth, axis, segment)
-    ekf2_state, ekf2_variance, truth = tracks.values()
-    ekf2_errors = compute_error_statistics(ekf2_state, ekf2_variance, truth)
-    innovations: TableOrUnavailable
-    if isinstance(ekf2, Unavailable):
-        innovations, gate = ekf2, DEFAULT_GATE
-    else:
-        innovations = projection.project_innovations(
-            flight, ekf2, prepared_comparison.source, axis, segment
-        )
-        gate = ekf2.gate
-        if isinstance(ekf2_errors, ErrorsAgainstTruth):
-            fusion_horizon_nees = _compute_nees_at_fusion_horizon(
-                projection.project_fusion_horizon_position(ekf2, axis, segment), truth
-            )
-            ekf2_errors = structs.replace(
-                ekf2_errors, nees_position_horizon_mean=fusion_horizon_nees
-            )
-    updates = kf_run.updates.assign(
-        prior_variance_m2=kf_run.updates["prior_position_variance_m2"],
-        posterior_variance_m2=kf_run.steps["position_variance_m2"].reindex(kf_run.updates.index),
-    )
+    ekf2_tracks, truth = tracks_and_truth = project_tracks(prepared_comparison, ekf2, axis, segment)
+    tracks: dict[FilterName, FilterTracks] = {"kf": make_run_tracks(kf_run), "ekf2": ekf2_tracks}
+    updates = kf_run.updates
     north, east, down = axis.direction.tolist()
-    rejected_flags = _drop_missing_values(innovations, "rejected")
+    rejected_flags = _drop_missing_values(ekf2_tracks.innovations, "rejected")
     return AxisComparison(
         heading_deg=axis.heading_deg,
         direction=(north, east, down),
@@ -112,51 +92,71 @@ def _compare_axis(
             input_gap_s=kf_run.input_gap_s,
         ),
         filters={
-            "kf": _summarise_filter(
-                updates,
-                kf_run.steps,
-                compute_kf_error_statistics(kf_run, truth, ekf2_state),
-                DEFAULT_GATE,
-            ),
-            "ekf2": _summarise_filter(innovations, ekf2_variance, ekf2_errors, gate),
+            name: _summarise_filter(
+                each,
+                compute_error_statistics(
+                    *find_compared_track(each, ekf2_tracks.state), truth, each.fusion_horizon
+                ),
+            )
+            for name, each in tracks.items()
         },
-        difference=compute_difference_statistics(kf_run, ekf2_state),
+        difference=compute_difference_statistics(kf_run, ekf2_tracks.state),
         rejected_fraction=float(rejected_flags.mean()) if len(rejected_flags) else None,
         axis=axis,
         kf_run=kf_run,
-        ekf2_innovations=innovations,
-        **tracks,
-        whole_flight_tracks=tracks
+        tracks=tracks,
+        truth=truth,
+        whole_flight_tracks=tracks_and_truth
         if segment.flight_span_s in (None, (segment.start_s, segment.end_s))
-        else project_tracks(ekf2, flight.truth, axis, segment.whole_flight),
+        else project_tracks(prepared_comparison, ekf2, axis, segment.whole_flight),
     )
 
 
+def make_run_tracks(run: KfRun) -> FilterTracks:
+    """Return the tracks of KF, or of another filter that px4fuse runs."""
+    innovations = run.updates.assign(
+        prior_variance_m2=run.updates["prior_position_variance_m2"],
+        posterior_variance_m2=run.steps["position_variance_m2"].reindex(run.updates.index),
+    )
+    return FilterTracks(run.steps, run.steps, innovations, run)
+
+
 def project_tracks(
-    ekf2: Ekf2 | Unavailable, truth: Truth | Unavailable, axis: Axis, segment: Segment
-) -> dict[str, TableOrUnavailable]:
-    """Project EKF2's state, EKF2's variances and ground truth onto an axis."""
-    projected_truth = projection.project_truth(truth, axis, segment)
-    if isinstance(ekf2, Unavailable):
-        return {"ekf2_state": ekf2, "ekf2_variance": ekf2, "truth": projected_truth}
-    return {
-        "ekf2_state": projection.project(ekf2.state, axis, segment),
-        "ekf2_variance": projection.project_variance(ekf2, axis, segment),
-        "truth": projected_truth,
-    }
+    prepared_comparison: PreparedComparison, ekf2: Ekf2 | Unavailable, axis: Axis, segment: Segment
+) -> tuple[FilterTracks, TableOrUnavailable]:
+    """Project EKF2 and ground truth onto an axis; innovations only in the analysed segment."""
+    ekf2_tracks = (
+        FilterTracks(ekf2, ekf2, ekf2)
+        if isinstance(ekf2, Unavailable)
+        else FilterTracks(
+            projection.project(ekf2.state, axis, segment),
+            projection.project_variance(ekf2, axis, segment),
+            projection.project_innovations(
+                prepared_comparison.flight,
+                ekf2,
+                prepared_comparison.source,
+                axis,
+                prepared_comparison.segment,
+            ),
+            gate=ekf2.gate,
+            fusion_horizon=projection.project_fusion_horizon_position(ekf2, axis, segment),
+        )
+    )
+    return ekf2_tracks, projection.project_truth(prepared_comparison.flight.truth, axis, segment)
 
 
 def _summarise_filter(
-    innovations: TableOrUnavailable,
-    variance: TableOrUnavailable,
-    truth: ErrorsAgainstTruth | Unavailable,
-    gate: float,
+    tracks: FilterTracks, truth: ErrorsAgainstTruth | Unavailable
 ) -> FilterSummary | UntestedFilter:
+    innovations, variance = tracks.innovations, tracks.variance
     fields: dict[str, Any] = {
         name: float(np.sqrt(values.median())) if len(values) else None
         for name, values in (
             ("sigma_p_median_m", _drop_missing_values(variance, "position_variance_m2")),
-            ("sigma_v_median_m_s", _drop_missing_values(variance, "velocity_variance_m2_s2")),
+            (
+                "sigma_v_median_m_s",
+                _drop_missing_values(variance, "velocity_variance_m2_s2"),
+            ),
             ("sigma_p_before_update_m", _drop_missing_values(innovations, "prior_variance_m2")),
             ("sigma_p_after_update_m", _drop_missing_values(innovations, "posterior_variance_m2")),
         )
@@ -166,7 +166,7 @@ def _summarise_filter(
         summary = innovations
     else:
         innovation_m, variance_m2 = innovations[INNOVATION_COLUMNS].to_numpy().T
-        summary = FilterSummary.from_innovations(innovation_m, variance_m2, gate, **fields)
+        summary = FilterSummary.from_innovations(innovation_m, variance_m2, tracks.gate, **fields)
     if isinstance(summary, Unavailable):
         return UntestedFilter(**structs.asdict(summary), **fields)
     return summary
@@ -206,30 +206,34 @@ def _compute_rmse(error: Array) -> float:
     return float(np.sqrt(np.nanmean(error**2)))
 
 
-def compute_kf_error_statistics(
-    kf_run: KfRun, truth: TableOrUnavailable, ekf2_state: TableOrUnavailable
-) -> ErrorsAgainstTruth | Unavailable:
-    """Compute the errors of KF against ground truth along one axis."""
-    kf_track = _predict_kf_track(kf_run, ekf2_state)
-    return compute_error_statistics(kf_track, kf_track, truth)
-
-
-def _predict_kf_track(kf_run: KfRun, ekf2_state: TableOrUnavailable) -> pd.DataFrame:
-    """Return state and covariance of KF at EKF2's sample times, if EKF2 is logged."""
-    output_times_s = (kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state).index
-    return predict_track(kf_run, output_times_s.to_numpy())
+def find_compared_track(
+    tracks: FilterTracks, ekf2_state: TableOrUnavailable
+) -> tuple[TableOrUnavailable, TableOrUnavailable]:
+    """Return state and variance of a filter, at EKF2's sample times if EKF2 is logged."""
+    if tracks.run is None:
+        return tracks.state, tracks.variance
+    times_s = (tracks.run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state).index
+    track = predict_track(tracks.run, times_s.to_numpy())
+    return track, track
 
 
 def compute_error_statistics(
-    state: TableOrUnavailable, variance: TableOrUnavailable, truth: TableOrUnavailable
+    state: TableOrUnavailable,
+    variance: TableOrUnavailable,
+    truth: TableOrUnavailable,
+    fusion_horizon: pd.DataFrame | None = None,
 ) -> ErrorsAgainstTruth | Unavailable:
-    """Compute the errors of a filter against ground truth along one axis."""
+    """Compute the errors of a filter against ground truth along one axis.
+
+    ``fusion_horizon`` is EKF2's position and variance at the fusion horizon.
+    """
     if isinstance(state, Unavailable):
         return state
     if isinstance(truth, Unavailable):
         return truth
     position_m, velocity_m_s = (_compute_errors(state, truth, column) for column in STATE_COLUMNS)
-    if np.isfinite(position_m).sum() < projection.MIN_COMMON_SAMPLES:
+    count = int(np.isfinite(position_m).sum())
+    if count < projection.MIN_COMMON_SAMPLES:
         return Unavailable(
             "error against ground truth",
             "filter and ground truth do not overlap in time",
@@ -237,25 +241,24 @@ def compute_error_statistics(
         )
     nees_position, nees_velocity = (
         _compute_mean_nees(error / interpolate_sigma(state.index.to_numpy(), variance, column))
-        for error, column in zip((position_m, velocity_m_s), VARIANCE_COLUMNS, strict=True)
+        for error, column in (
+            (position_m, "position_variance_m2"),
+            (velocity_m_s, "velocity_variance_m2_s2"),
+        )
     )
+    nees_at_horizon = None
+    if fusion_horizon is not None:
+        sigma_m = np.sqrt(fusion_horizon["position_variance_m2"].to_numpy())
+        nees_at_horizon = _compute_mean_nees(
+            _compute_errors(fusion_horizon, truth, "position_m") / sigma_m
+        )
     return ErrorsAgainstTruth(
-        count=int(np.isfinite(position_m).sum()),
+        count=count,
         position_rmse_m=_compute_rmse(position_m),
         velocity_rmse_m_s=_compute_rmse(velocity_m_s) if np.isfinite(velocity_m_s).any() else None,
         nees_position_mean=nees_position,
         nees_velocity_mean=nees_velocity,
-    )
-
-
-def _compute_nees_at_fusion_horizon(
-    fusion_horizon_state: pd.DataFrame | None, truth: TableOrUnavailable
-) -> float | None:
-    if fusion_horizon_state is None or isinstance(truth, Unavailable):
-        return None
-    errors_m = _compute_errors(fusion_horizon_state, truth, "position_m")
-    return _compute_mean_nees(
-        errors_m / np.sqrt(fusion_horizon_state["position_variance_m2"].to_numpy())
+        nees_position_horizon_mean=nees_at_horizon,
     )
 
 
@@ -288,15 +291,15 @@ def compute_position_errors(
     """
     if isinstance(axis_result.truth, Unavailable):
         return axis_result.truth
-    state, variance = axis_result.ekf2_state, axis_result.ekf2_variance
-    if filter_name == "kf":
-        state = variance = _predict_kf_track(axis_result.kf_run, state)
+    state, variance = find_compared_track(axis_result.tracks[filter_name], axis_result.ekf2.state)
     if isinstance(state, Unavailable):
         return state
     time_s = state.index.to_numpy()
-    errors_m = _compute_errors(state, axis_result.truth, STATE_COLUMNS[0])
-    sigma_m = interpolate_sigma(time_s, variance, VARIANCE_COLUMNS[0])
-    return pd.DataFrame({"error_m": errors_m, "sigma_m": sigma_m}, index=time_s)
+    errors_m = {
+        "error_m": _compute_errors(state, axis_result.truth, "position_m"),
+        "sigma_m": interpolate_sigma(time_s, variance, "position_variance_m2"),
+    }
+    return pd.DataFrame(errors_m, time_s)
 
 
 def compute_normalised_errors(
@@ -306,8 +309,8 @@ def compute_normalised_errors(
     errors = compute_position_errors(axis_result, filter_name)
     if isinstance(errors, Unavailable):
         return errors
-    if filter_name == "ekf2" and isinstance(axis_result.ekf2_variance, Unavailable):
-        return axis_result.ekf2_variance
+    if isinstance(variance := axis_result.tracks[filter_name].variance, Unavailable):
+        return variance
     normalised_errors = (errors["error_m"] / errors["sigma_m"]).dropna()
     if normalised_errors.empty:
         return Unavailable(
@@ -319,10 +322,12 @@ def compute_normalised_errors(
 
 
 def _assess_horizontal_innovations(
-    north_and_east: list[TableOrUnavailable],
+    north_and_east: Iterable[FilterTracks],
 ) -> HorizontalNis | None:
     tables = [
-        table[INNOVATION_COLUMNS] for table in north_and_east if isinstance(table, pd.DataFrame)
+        tracks.innovations[INNOVATION_COLUMNS]
+        for tracks in north_and_east
+        if isinstance(tracks.innovations, pd.DataFrame)
     ]
     if len(tables) < 2:
         return None

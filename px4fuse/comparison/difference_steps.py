@@ -129,9 +129,9 @@ def _make_comparable_settings(
 def _compare_outside_replay(
     axis_result: AxisComparison, kf_run: KfRun, spans_s: Spans
 ) -> DifferenceOutsideReplay | None:
-    if isinstance(axis_result.ekf2_state, Unavailable):
+    if isinstance(state := axis_result.ekf2.state, Unavailable):
         return None
-    position_m = axis_result.ekf2_state["position_m"]
+    position_m = state["position_m"]
     position_m = position_m[~is_inside_spans(position_m.index, spans_s)]
     kf_track = predict_track(kf_run, position_m.index.to_numpy())
     difference_m = (position_m - kf_track["position_m"].to_numpy()).abs()

@@ -24,14 +24,47 @@ from px4fuse.core.record import (
     one_line_repr,
 )
 from px4fuse.errors import MissingDataError, suggest_name
-from px4fuse.filter.consistency import Consistency, HorizontalNis, classify_sigma_ratio
+from px4fuse.filter.consistency import (
+    DEFAULT_GATE,
+    Consistency,
+    HorizontalNis,
+    classify_sigma_ratio,
+)
 from px4fuse.filter.kalman import KfRun
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Axis, Segment, cut_to_segment
 from px4fuse.flight.model import Flight, PositionTrack, TableOrUnavailable
 
 FilterName = Literal["kf", "ekf2"]
-FILTER_NAMES: Mapping[FilterName, Literal["KF", "EKF2"]] = {"kf": "KF", "ekf2": "EKF2"}
+FILTER_NAMES: Mapping[FilterName, str] = {"kf": "KF", "ekf2": "EKF2"}
+
+
+@dataclass(frozen=True)
+class FilterTracks:
+    """State, reported variance and innovations of one filter along an axis.
+
+    Attributes
+    ----------
+    state : DataFrame or Unavailable
+        Position and velocity; for EKF2 without resets of the frame's origin.
+    innovations : DataFrame or Unavailable
+        Innovations, and position variance before and after each update.
+    run : KfRun or None
+        Run of the filter by px4fuse; None for EKF2, whose states are logged.
+    gate : float
+        Limit of |ν|/√S for the statistics of the innovations.
+    fusion_horizon : DataFrame or None
+        Position of EKF2 and its variance at the fusion horizon, if logged.
+    """
+
+    state: TableOrUnavailable
+    variance: TableOrUnavailable
+    innovations: TableOrUnavailable
+    run: KfRun | None = None
+    gate: float = DEFAULT_GATE
+    fusion_horizon: pd.DataFrame | None = None
+
+    __repr__ = one_line_repr
 
 
 class ErrorsAgainstTruth(Record, kw_only=True):
@@ -126,12 +159,8 @@ class AxisComparison(Record, kw_only=True):
         Reason for the direction of the axis, as text.
     rejected_fraction : float or None
         Fraction of the positions that EKF2 rejected; None if not logged.
-    ekf2_state : DataFrame or Unavailable
-        Position and velocity of EKF2 without resets of the frame's origin.
-    ekf2_innovations : DataFrame or Unavailable
-        Innovations of EKF2, and its position variance before and after each update.
-    whole_flight_tracks : mapping from attribute name to DataFrame or Unavailable
-        State and variance of EKF2, and ground truth, over the whole flight.
+    whole_flight_tracks : (FilterTracks, DataFrame or Unavailable)
+        EKF2 and ground truth over the whole flight, innovations only in the segment.
     """
 
     heading_deg: float | None = None
@@ -143,15 +172,18 @@ class AxisComparison(Record, kw_only=True):
     rejected_fraction: Share | None = None
     axis: NotWritten[Axis] = NOT_WRITTEN
     kf_run: NotWritten[KfRun] = NOT_WRITTEN
-    ekf2_state: NotWritten[TableOrUnavailable] = NOT_WRITTEN
-    ekf2_variance: NotWritten[TableOrUnavailable] = NOT_WRITTEN
-    ekf2_innovations: NotWritten[TableOrUnavailable] = NOT_WRITTEN
+    tracks: NotWritten[Mapping[FilterName, FilterTracks]] = NOT_WRITTEN
     truth: NotWritten[TableOrUnavailable] = NOT_WRITTEN
-    whole_flight_tracks: NotWritten[Mapping[str, TableOrUnavailable]] = NOT_WRITTEN
+    whole_flight_tracks: NotWritten[tuple[FilterTracks, TableOrUnavailable]] = NOT_WRITTEN
+
+    @property
+    def ekf2(self) -> FilterTracks:
+        return self.tracks["ekf2"]
 
     def with_whole_flight_tracks(self) -> "AxisComparison":
         """Return a copy with EKF2 and ground truth over the whole flight, for plots."""
-        return structs.replace(self, **self.whole_flight_tracks)
+        ekf2, truth = self.whole_flight_tracks
+        return structs.replace(self, tracks={**self.tracks, "ekf2": ekf2}, truth=truth)
 
 
 @dataclass(frozen=True)
@@ -200,7 +232,7 @@ class Comparison(PreparedComparison):
     Attributes
     ----------
     axes : mapping from axis name to AxisComparison
-    horizontal : mapping from "kf" and "ekf2" to HorizontalNis
+    horizontal : mapping from filter name to HorizontalNis
         NIS of north and east together, if both were analysed.
     """
 

@@ -24,7 +24,8 @@ from px4fuse.comparison.comparison import (
     compare,
     compute_difference_statistics,
     compute_error_statistics,
-    compute_kf_error_statistics,
+    find_compared_track,
+    make_run_tracks,
 )
 from px4fuse.comparison.estimates import Estimates, TuningByAxis
 from px4fuse.comparison.model import (
@@ -208,23 +209,24 @@ def _find_changes_to_test(
 
     ``ekf2_inputs`` is None for KF.
     """
-    summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
-    if not isinstance(summary, FilterSummary) or (
-        ekf2_inputs is not None and axis_result.axis.name == "down"
-    ):
+    axis, summary = (
+        axis_result.axis.name,
+        axis_result.filters["kf" if ekf2_inputs is None else "ekf2"],
+    )
+    if not isinstance(summary, FilterSummary) or (ekf2_inputs is not None and axis == "down"):
         return []  # EKF2's replay contains no vertical position
     statistics: list[Statistic] = ["nees"] if find_error_above_sigma(summary) else []
     if is_inconsistent(summary):
         statistics.append("nis")
     candidates = {
         statistic: find_candidate_changes(
-            comparison, estimates, ekf2_inputs, axis_result, statistic
+            comparison, estimates, ekf2_inputs, axis, summary, statistic
         )
         for statistic in statistics
     }
     changes = remove_repeated_changes(chain.from_iterable(candidates.values()))
     if axis_result is comparison.main:
-        changes = find_main_axis_changes(comparison, estimates, ekf2_inputs)
+        changes = find_main_axis_changes(comparison, estimates, ekf2_inputs, axis, summary)
     return [
         (change, tuple(statistic for statistic in statistics if change in candidates[statistic]))
         for change in changes
@@ -275,19 +277,19 @@ def _find_statistics_without_change(
     tested_filter: _Filter, axis_result: AxisComparison
 ) -> tuple[RunStatistics, bool]:
     """Return the statistics without a change, and True if they are from the log."""
-    replayed, logged_state = tested_filter.rerun(axis_result, {}), axis_result.ekf2_state
-    evaluated_spans_s, innovations = tested_filter.evaluated_spans_s, axis_result.ekf2_innovations
+    replayed, ekf2 = tested_filter.rerun(axis_result, {}), axis_result.ekf2
+    evaluated_spans_s, innovations = tested_filter.evaluated_spans_s, ekf2.innovations
     if evaluated_spans_s is None:
         return replayed, True
-    if isinstance(logged_state, Unavailable) or isinstance(innovations, Unavailable):
+    if isinstance(ekf2.state, Unavailable) or isinstance(innovations, Unavailable):
         return replayed, False
-    logged_state = rows_inside(logged_state, evaluated_spans_s)
+    logged_state = rows_inside(ekf2.state, evaluated_spans_s)
     innovations = rows_inside(innovations, evaluated_spans_s)
     rejected_flags = innovations["rejected"].dropna()
     logged = _summarise_run(
         innovations["innovation_m"].to_numpy(),
         innovations["innovation_variance_m2"].to_numpy(),
-        compute_error_statistics(logged_state, axis_result.ekf2_variance, axis_result.truth),
+        compute_error_statistics(logged_state, ekf2.variance, axis_result.truth),
         compute_difference_statistics(axis_result.kf_run, logged_state),
         float((rejected_flags > 0.0).mean()) if len(rejected_flags) else None,
     )
@@ -328,7 +330,7 @@ def _rotate_direction(direction: Array, rotation_deg: float) -> Array:
 def _rerun_kf(
     comparison: Comparison, tuning: TuningByAxis, axis_result: AxisComparison, change: Change
 ) -> RunStatistics:
-    axis, truth, ekf2_state = axis_result.axis, axis_result.truth, axis_result.ekf2_state
+    axis, truth, ekf2_state = axis_result.axis, axis_result.truth, axis_result.ekf2.state
     kf_settings: dict[str, Any] = {
         name: change[name] for name in change if name in vars(Settings())
     }
@@ -359,7 +361,7 @@ def _rerun_kf(
     return _summarise_run(
         kf_run.updates["innovation_m"].to_numpy(),
         kf_run.updates["innovation_variance_m2"].to_numpy(),
-        compute_kf_error_statistics(kf_run, truth, ekf2_state),
+        compute_error_statistics(*find_compared_track(make_run_tracks(kf_run), ekf2_state), truth),
         None if rotates_gnss_positions else compute_difference_statistics(kf_run, ekf2_state),
     )
 
@@ -431,7 +433,7 @@ def _summarise_replay(
     )
     published_track = project(ekf2_replay.published_state, axis, comparison.segment)
     published_track = rows_inside(published_track, evaluated_spans_s)
-    logged_state, track_compared_with_kf = axis_result.ekf2_state, published_track
+    logged_state, track_compared_with_kf = axis_result.ekf2.state, published_track
     # Without a change, compare KF with the logged EKF2, as in the report
     if not change and not isinstance(logged_state, Unavailable):
         track_compared_with_kf = rows_inside(logged_state, evaluated_spans_s)

@@ -158,14 +158,14 @@ def _make_axis_inputs(axis: Axis, source_track: PositionTrack, encoder: ArrayEnc
 
 
 def _make_axis_data(analysis: Analysis, result: AxisComparison, encoder: ArrayEncoder) -> PageData:
-    name = result.axis.name
+    name, whole_flight = result.axis.name, result.with_whole_flight_tracks()
     return {
         "note": result.axis.note,
         "bands": _pack_nis_bands(len(result.axis.measurement_time_s), encoder),
         # key of the noise estimate: north and east may have a common estimate
         "noises": HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name,
-        "ekf2": _make_ekf2_data(analysis, result.with_whole_flight_tracks(), encoder),
-        "truth": _make_truth_data(result.with_whole_flight_tracks(), encoder),
+        "ekf2": _make_ekf2_data(whole_flight, encoder),
+        "truth": _make_truth_data(whole_flight, encoder),
     }
 
 
@@ -179,15 +179,14 @@ def _pack_nis_bands(innovation_count: int, encoder: ArrayEncoder) -> list[dict[s
     return [encoder.add(bound / innovation_counts, DRAWN_VALUE_STEPS_PER_UNIT) for bound in bounds]
 
 
-def _make_ekf2_data(
-    analysis: Analysis, result: AxisComparison, encoder: ArrayEncoder
-) -> PageData | None:
-    if isinstance(result.ekf2_state, Unavailable):
+def _make_ekf2_data(result: AxisComparison, encoder: ArrayEncoder) -> PageData | None:
+    ekf2, summary = result.ekf2, result.filters["ekf2"]
+    if isinstance(ekf2.state, Unavailable):
         return None
-    state, summary = result.ekf2_state.dropna(), result.filters["ekf2"]
+    state = ekf2.state.dropna()
     state_columns = [state["position_m"], state["velocity_m_s"]]
-    if isinstance(result.ekf2_variance, pd.DataFrame):
-        sigma = result.ekf2_variance.dropna().pow(0.5)
+    if isinstance(ekf2.variance, pd.DataFrame):
+        sigma = ekf2.variance.dropna().pow(0.5)
         state_columns += [
             np.interp(state.index, sigma.index, sigma[name])
             for name in ("position_variance_m2", "velocity_variance_m2_s2")
@@ -202,8 +201,7 @@ def _make_ekf2_data(
         },
         "r": None,
     }
-    if isinstance(result.ekf2_innovations, pd.DataFrame):
-        innovations = result.ekf2_innovations
+    if isinstance(innovations := ekf2.innovations, pd.DataFrame):
         rows = innovations[
             np.isfinite(innovations["innovation_m"]) & (innovations["innovation_variance_m2"] > 0)
         ]

@@ -144,7 +144,7 @@ def make_hidden_error_finding(
     elif is_misaligned:
         remedy = FRAME_REMEDY
     elif (
-        "kf" not in error_by_filter
+        error_by_filter.keys() == {"ekf2"}
         and isinstance(kf_errors, ErrorsAgainstTruth)
         and kf_errors.position_rmse_m < MAX_KF_TO_EKF2_RMSE_RATIO * worst_error.rmse_m
     ):

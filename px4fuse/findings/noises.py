@@ -312,7 +312,7 @@ def _make_wrong_sigma_finding(
         cause = classify_cause(analysis, rerun)
         remedy_text = _find_action_for_wrong_sigma(analysis, filter_name, worst_axis, rerun)
         is_kf_noise_of_receiver = (
-            filter_name == "kf" and is_underconfident and analysis.source.origin.is_gnss
+            filter_name != "ekf2" and is_underconfident and analysis.source.origin.is_gnss
         )
         if remedy_text == KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION or is_kf_noise_of_receiver:
             severity = "note"
@@ -387,8 +387,8 @@ def _format_noise_minimum(analysis: Analysis) -> str:
 def _has_default_noises(
     analysis: Analysis, filter_name: FilterName, result: AxisComparison
 ) -> bool:
-    """Return True if a filter uses default noise settings: px4fuse's (KF) or PX4's (EKF2)."""
-    if filter_name == "kf":
+    """Return True if a filter uses default noise settings: PX4's (EKF2) or px4fuse's."""
+    if filter_name != "ekf2":
         settings, defaults = analysis.settings, Settings()
         return (settings.sigma_z_m, settings.sigma_a_m_s2) == (
             defaults.sigma_z_m,
@@ -453,7 +453,7 @@ def _find_sigma_action_without_replay(
 
 def find_ekf2_noise_m(result: AxisComparison) -> float:
     """Return EKF2's median measurement noise √R (m) along an axis; NaN if unknown."""
-    innovations = result.ekf2_innovations
+    innovations = result.ekf2.innovations
     if isinstance(innovations, Unavailable):
         return np.nan
     return float(np.sqrt(innovations["observation_variance_m2"].median()))

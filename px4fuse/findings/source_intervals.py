@@ -149,15 +149,15 @@ def _find_ekf2_errors_at_end(analysis: Analysis, span_s: Span) -> dict[str, floa
     """Return EKF2's horizontal position error and reported σ (m) at the end of a time span."""
     axes, squared_errors_m2 = select_north_and_east(analysis), []
     for result in axes if len(axes) == 2 else [analysis.main]:
-        tracks = result.with_whole_flight_tracks()
-        if isinstance(tracks.ekf2_state, Unavailable):
+        ekf2, truth = result.whole_flight_tracks
+        if isinstance(ekf2.state, Unavailable):
             return {}
-        position_m = tracks.ekf2_state["position_m"].loc[slice(*span_s)]
+        position_m = ekf2.state["position_m"].loc[slice(*span_s)]
         time_s, error_m = position_m.index.to_numpy(), np.full(len(position_m), np.nan)
-        if isinstance(tracks.truth, pd.DataFrame):
-            true_m = tracks.truth["position_m"]
+        if isinstance(truth, pd.DataFrame):
+            true_m = truth["position_m"]
             error_m = position_m - np.interp(time_s, true_m.index, true_m, np.nan, np.nan)
-        sigma_m = interpolate_sigma(time_s, tracks.ekf2_variance, "position_variance_m2")
+        sigma_m = interpolate_sigma(time_s, ekf2.variance, "position_variance_m2")
         squared_errors_m2.append([error_m**2, sigma_m**2])
     error_m, sigma_m = np.sqrt(np.sum(squared_errors_m2, axis=0))
     return {
@@ -170,7 +170,7 @@ def _find_ekf2_errors_at_end(analysis: Analysis, span_s: Span) -> dict[str, floa
 def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
     """Describe the position errors of KF and EKF2 at the end of a gap."""
     result, end_s = analysis.main, gap_span_s[1]
-    axis, ekf2, ekf2_state = result.axis, analysis.flight.ekf2, result.ekf2_state
+    axis, ekf2, ekf2_state = result.axis, analysis.flight.ekf2, result.ekf2.state
     reference_m = float(axis.measurement_m[np.searchsorted(axis.measurement_time_s, end_s)])
     quantity = "Distance from the estimate to the first position after the gap,"
     if isinstance(result.truth, pd.DataFrame):
@@ -187,7 +187,7 @@ def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
         elif isinstance(ekf2, Ekf2) and ekf2.aids:
             aiding_sentence = "In the gap KF and EKF2 rely on the IMU alone."
         ekf2_text = f"EKF2 {format_metres(abs(positions_before.iloc[-1] - reference_m))} m"
-        variance = result.ekf2_variance
+        variance = result.ekf2.variance
         if isinstance(variance, pd.DataFrame) and len(variance):
             variance_m2 = np.interp(
                 positions_before.index[-1], variance.index, variance["position_variance_m2"]

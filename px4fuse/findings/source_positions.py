@@ -464,7 +464,7 @@ def compute_outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[
 
 
 def _format_rejected_outliers(analysis: Analysis, outlier_time_s: Array) -> str:
-    innovations = analysis.main.ekf2_innovations
+    innovations = analysis.main.ekf2.innovations
     position_count = len(analysis.main.axis.measurement_time_s)
     if (
         isinstance(innovations, Unavailable)

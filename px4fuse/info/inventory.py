@@ -11,7 +11,6 @@ from px4fuse.comparison.comparison import project_tracks
 from px4fuse.comparison.flight_events import compute_max_interval_s
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.preparation import prepare_comparison_inputs, select_source_innovations
-from px4fuse.comparison.projection import project_innovations
 from px4fuse.core.text import capitalise_first, format_utc_time, to_json_types
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.inputs import prepare_inputs
@@ -325,27 +324,18 @@ def _list_ekf2_and_truth_analyses(
 ) -> Iterator[AnalysisOption]:
     """Yield the analyses that need EKF2 data or ground truth."""
     ekf2 = flight.ekf2
-    innovations: object = ekf2
-    tracks: Mapping[str, object] = {
-        "ekf2_state": ekf2,
-        "ekf2_variance": ekf2,
-        "truth": flight.truth,
-    }
+    required_data: tuple[object, ...] = (ekf2, ekf2, ekf2, flight.truth)
     if comparison is not None:
         main_axis, segment = comparison.input_axes[0], comparison.segment
-        tracks = project_tracks(ekf2, comparison.flight.truth, main_axis, segment)
-        if isinstance(ekf2, Ekf2):
-            innovations = project_innovations(flight, ekf2, comparison.source, main_axis, segment)
-    for name, data, sample_text in (
-        ("EKF2 states", tracks["ekf2_state"], "samples of EKF2's position and velocity"),
-        (
-            "EKF2 variances",
-            tracks["ekf2_variance"],
-            "samples of EKF2's position and velocity variances",
-        ),
-        ("EKF2 consistency", innovations, "EKF2 innovations"),
-        ("position error", tracks["truth"], "samples of ground truth"),
-    ):
+        tracks, truth = project_tracks(comparison, ekf2, main_axis, segment)
+        required_data = (tracks.state, tracks.variance, tracks.innovations, truth)
+    names_and_sample_texts = (
+        ("EKF2 states", "samples of EKF2's position and velocity"),
+        ("EKF2 variances", "samples of EKF2's position and velocity variances"),
+        ("EKF2 consistency", "EKF2 innovations"),
+        ("position error", "samples of ground truth"),
+    )
+    for (name, sample_text), data in zip(names_and_sample_texts, required_data, strict=True):
         if isinstance(data, pd.DataFrame):
             yield AnalysisOption(name, True, f"from {len(data)} {sample_text}")
         elif isinstance(data, Unavailable):

@@ -122,11 +122,10 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
 
 
 def _select_tested_innovations(result: AxisComparison) -> InnovationsByFilter:
-    consistency_by_name = get_statistics_by_filter(result)
     return {
         name: values
         for name, values in normalised_innovations(result).items()
-        if isinstance(consistency_by_name.get(name), Consistency)
+        if isinstance(get_statistics_by_filter(result)[name], Consistency)
     }
 
 
@@ -159,7 +158,9 @@ def _draw_histogram(axes: Axes, innovations: InnovationsByFilter) -> None:
 
 
 def _draw_autocorrelation(axes: Axes, innovations: InnovationsByFilter) -> None:
-    for shift, (name, values) in zip((-0.18, 0.18), innovations.items(), strict=False):
+    for shift, (name, values) in zip(
+        np.linspace(-0.18, 0.18, len(FILTER_NAMES)), innovations.items(), strict=False
+    ):
         lag_count = min(MAX_AUTOCORRELATION_LAG, len(values) // 3)
         correlations = compute_autocorrelation(np.asarray(values, np.float64), lag_count)
         bar_lags = np.arange(1, lag_count + 1) + shift

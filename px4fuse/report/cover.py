@@ -247,15 +247,15 @@ def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
         errors = compute_position_errors(result, filter_name)
         if isinstance(errors, pd.DataFrame) and errors["error_m"].notna().any():
             rmse_m = effect.position_rmse_m.get(filter_name) if effect else None
-            title = f"{label} error (m): RMSE"
-            plots.append((title, rmse_m, errors["error_m"], {label: errors["sigma_m"]}))
-    if not plots and isinstance(result.ekf2_state, pd.DataFrame):
-        time_s = result.ekf2_state.index.to_numpy()
+            sigmas_m = {label: errors["sigma_m"]}
+            plots.append((f"{label} error (m): RMSE", rmse_m, errors["error_m"], sigmas_m))
+    if not plots and isinstance(result.ekf2.state, pd.DataFrame):
+        time_s = result.ekf2.state.index.to_numpy()
         kf_track = predict_track(result.kf_run, time_s)
-        difference_m = kf_track["position_m"] - result.ekf2_state["position_m"]
+        difference_m = kf_track["position_m"] - result.ekf2.state["position_m"]
         sigmas_m = {
             name: pd.Series(interpolate_sigma(time_s, table, "position_variance_m2"), time_s)
-            for name, table in (("KF", kf_track), ("EKF2", result.ekf2_variance))
+            for name, table in (("KF", kf_track), ("EKF2", result.ekf2.variance))
         }
         difference_rms_m = effect.difference_rms_m if effect else None
         if difference_m.notna().any():
@@ -303,7 +303,7 @@ def _make_error_plot(
 
 def _make_innovation_plot(result: AxisComparison) -> TimePlot:
     innovations = normalised_innovations(result)
-    legend = ", ".join(f"{sign} {name}" for name, sign in zip(innovations, "●■", strict=False))
+    legend = ", ".join(f"{style.INNOVATION_SIGNS[name]} {name}" for name in innovations)
     title = f"Innovations ÷ √S ({legend}): 95 % expected within ±2"
     clipped_texts = [
         f"{name} {format_ratio(ratio)}"
@@ -352,8 +352,12 @@ def _select_map_tracks(analysis: Analysis) -> dict[str, Array]:
         return flown[["north_m", "east_m"]].to_numpy().T
 
     tracks = {"positions": cut_to_flight(analysis.source.samples)}
-    if len(results) == 2:
-        tracks["KF"] = np.array([result.kf_run.steps["position_m"] for result in results])
+    for name, label in FILTER_NAMES.items():
+        positions_m = [
+            run.steps["position_m"] for result in results if (run := result.tracks[name].run)
+        ]
+        if len(positions_m) == 2:
+            tracks[label] = np.array(positions_m)
     if isinstance(flight.ekf2, Ekf2):
         tracks["EKF2"] = cut_to_flight(flight.ekf2.state)
     if isinstance(flight.truth, Truth):

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import AxisComparison
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison
 from px4fuse.core.record import Span
 from px4fuse.report import panels, style
 from px4fuse.report.difference_page import describe_missing_explanation
@@ -45,34 +45,37 @@ def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
 
 def _draw_enlarged_sigma_plot(page: Page, result: AxisComparison) -> None:
     """Draw σ of position over a few updates."""
-    start_s, end_s = zoom_span_s = find_zoom_span(result)
+    start_s, end_s = find_zoom_span(result)
     title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
     axes = page.add_panel(title, ENLARGED_PLOT_HEIGHT, caption=_describe_sigma_at_updates(result))
-    updates, steps = result.kf_run.updates, result.kf_run.steps
-    variances_m2 = pd.concat([updates["prior_position_variance_m2"], steps["position_variance_m2"]])
-    # A stable sort keeps the prior variance before the posterior variance
-    variances_m2 = variances_m2.sort_index(kind="stable").loc[start_s:end_s]
-    axes.plot(np.sqrt(variances_m2), **TRACK_STYLES["KF"])
-    if isinstance(result.ekf2_innovations, pd.DataFrame):
-        ekf2_updates = result.ekf2_innovations.loc[start_s:end_s]
+    ekf2 = result.ekf2
+    for name, tracks in result.tracks.items():
+        if run := tracks.run:
+            variances_m2 = pd.concat(
+                [run.updates["prior_position_variance_m2"], run.steps["position_variance_m2"]]
+            )
+            # A stable sort keeps the prior variance before the posterior variance
+            variances_m2 = variances_m2.sort_index(kind="stable").loc[start_s:end_s]
+            axes.plot(np.sqrt(variances_m2), **TRACK_STYLES[FILTER_NAMES[name]])
+    if isinstance(ekf2.innovations, pd.DataFrame):
+        ekf2_updates = ekf2.innovations.loc[start_s:end_s]
         for side, marker in (("prior", "^"), ("posterior", "v")):
             sigma_m = np.sqrt(ekf2_updates[f"{side}_variance_m2"])
             axes.plot(sigma_m, **style.dot_style(EKF2_COLOUR, marker, 3.6, 0.7), mfc="none")
-    if isinstance(result.ekf2_variance, pd.DataFrame):
-        logged_sigma_m = np.sqrt(result.ekf2_variance["position_variance_m2"].loc[start_s:end_s])
+    if isinstance(ekf2.variance, pd.DataFrame):
+        logged_sigma_m = np.sqrt(ekf2.variance["position_variance_m2"].loc[start_s:end_s])
         axes.plot(logged_sigma_m, **style.dot_style(EKF2_COLOUR, "s", 3.0, 0.7), mfc="white")
-    axes.set_xlim(*zoom_span_s)
+    axes.set_xlim(start_s, end_s)
     axes.set_xlabel(style.TIME_LABEL)
-    if isinstance(result.ekf2_state, pd.DataFrame):
+    if isinstance(ekf2.state, pd.DataFrame):
         page.write_small_text("EKF2: ▵ before and ▿ after an update, □ logged σ.")
 
 
 def find_zoom_span(result: AxisComparison) -> Span:
     """Return the start and end (s) of a few updates in the middle of the flight."""
-    update_times_s = result.kf_run.updates.index.to_numpy()
-    centre_times_s = update_times_s
-    if isinstance(result.ekf2_innovations, pd.DataFrame) and len(result.ekf2_innovations):
-        centre_times_s = result.ekf2_innovations.index.to_numpy()
+    centre_times_s = update_times_s = result.kf_run.updates.index.to_numpy()
+    if isinstance(innovations := result.ekf2.innovations, pd.DataFrame) and len(innovations):
+        centre_times_s = innovations.index.to_numpy()
     start_s = float(centre_times_s[len(centre_times_s) // 2])
     interval_s = np.median(np.diff(update_times_s)) if len(update_times_s) > 1 else 0.0
     return start_s, start_s + max(float(ZOOM_UPDATE_COUNT * interval_s), MIN_ZOOM_S)

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import AxisComparison, Difference
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, Difference, FilterTracks
 from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -197,14 +197,14 @@ def add_legend(page: Page, analysis: Analysis) -> PageBlock:
     all_rejection_times_s = [
         time for times in analysis.events.rejection_times_s.values() for time in times
     ]
+    kf_line, *other_lines = (
+        Line2D([], [], **TRACK_STYLES[name], label=name) for name in _collect_states(analysis.main)
+    )
     entries: list[Artist] = [
         Line2D([], [], **style.MEASUREMENT_STYLE | {"ms": 5.0}, label="position"),
-        Line2D([], [], **TRACK_STYLES["KF"], label="KF"),
+        kf_line,
         Patch(facecolor=style.KF_BAND_COLOUR, lw=0, label="±2σ reported"),
-        *(
-            Line2D([], [], **TRACK_STYLES[name], label=name)
-            for name in _list_ekf2_and_truth_tracks(analysis.main)
-        ),
+        *other_lines,
         *(
             Patch(**event_style, label=label)
             if height is None
@@ -217,28 +217,39 @@ def add_legend(page: Page, analysis: Analysis) -> PageBlock:
     return page.add_legend(entries)
 
 
-def select_available_tables(**tables: object) -> dict[str, pd.DataFrame]:
-    return {name: table for name, table in tables.items() if isinstance(table, pd.DataFrame)}
+def _select_available_tables(
+    result: AxisComparison, get_table: Callable[[FilterTracks], object]
+) -> dict[str, pd.DataFrame]:
+    """Return a table of each filter, by the label of the filter."""
+    return {
+        FILTER_NAMES[name]: table
+        for name, tracks in result.tracks.items()
+        if isinstance(table := get_table(tracks), pd.DataFrame)
+    }
 
 
-def _list_ekf2_and_truth_tracks(result: AxisComparison) -> dict[str, pd.DataFrame]:
-    return select_available_tables(**{"EKF2": result.ekf2_state, "ground truth": result.truth})
+def _collect_states(result: AxisComparison) -> dict[str, pd.DataFrame]:
+    """Return positions and velocities of KF, of the other filters and of ground truth."""
+    states = _select_available_tables(result, lambda tracks: tracks.state)
+    if isinstance(result.truth, pd.DataFrame):
+        states["ground truth"] = result.truth
+    return states
 
 
 def draw_tracks(axes: Axes, result: AxisComparison, quantity: QuantityColumns) -> None:
-    """Draw position or velocity: measurements, KF with ±2σ, EKF2 and ground truth."""
+    """Draw position or velocity: measurements, KF with ±2σ, other filters and ground truth."""
     if quantity is POSITION_QUANTITY:
         measurements = pd.Series(result.axis.measurement_m, result.axis.measurement_time_s)
         draw_curve(axes, measurements, **style.MEASUREMENT_STYLE)
-    kf_values = result.kf_run.steps[quantity.column]
-    draw_sigma_band(axes, kf_values, np.sqrt(result.kf_run.steps[quantity.variance_column]))
-    drawn_series = [kf_values]
-    for name, track in _list_ekf2_and_truth_tracks(result).items():
-        values = track[quantity.column]
+    kf_steps, drawn_series = result.kf_run.steps, []
+    draw_sigma_band(axes, kf_steps[quantity.column], np.sqrt(kf_steps[quantity.variance_column]))
+    states = _collect_states(result)
+    states["KF"] = states.pop("KF")  # drawn last
+    for name, state in states.items():
+        values = state[quantity.column]
         if values.notna().any():
-            draw_curve(axes, values, **TRACK_STYLES[name], zorder=2.5)
+            draw_curve(axes, values, **TRACK_STYLES[name], zorder=2.0 if name == "KF" else 2.5)
             drawn_series.append(values)
-    draw_curve(axes, kf_values, **TRACK_STYLES["KF"])
     # The ±2σ band is very wide at the start, so it does not set the axis limits
     all_values = pd.concat(drawn_series)
     margin = 0.08 * (all_values.max() - all_values.min()) + 1e-3
@@ -261,16 +272,16 @@ def _describe_errors(result: AxisComparison, quantity: QuantityColumns) -> str:
 def _find_innovation_limit_m(result: AxisComparison) -> float:
     limits_m = []
     for innovations in _collect_innovation_tables(result).values():
-        median_sqrt_s_m = float(np.sqrt(innovations["innovation_variance_m2"].median()))
+        median_sqrt_s_m = np.sqrt(innovations["innovation_variance_m2"].median())
         # a quantile, because outliers would enlarge the axis
-        quantile_m = float(np.quantile(innovations["innovation_m"].abs(), 0.99))
-        limits_in_sqrt_s = np.array([2.0, MAX_AXIS_LIMIT_IN_SQRT_S])
-        limits_m.append(float(np.clip(quantile_m, *limits_in_sqrt_s * median_sqrt_s_m)))
+        quantile_m = np.quantile(innovations["innovation_m"].abs(), 0.99)
+        highest_limit_m = MAX_AXIS_LIMIT_IN_SQRT_S * median_sqrt_s_m
+        limits_m.append(float(np.clip(quantile_m, 2.0 * median_sqrt_s_m, highest_limit_m)))
     return INNOVATION_AXIS_MARGIN_FACTOR * max(limits_m)
 
 
 def _collect_innovation_tables(result: AxisComparison) -> dict[str, pd.DataFrame]:
-    return select_available_tables(KF=result.kf_run.updates, EKF2=result.ekf2_innovations)
+    return _select_available_tables(result, lambda tracks: tracks.innovations)
 
 
 def normalised_innovations(result: AxisComparison) -> dict[str, pd.Series[float]]:
@@ -294,54 +305,42 @@ def draw_dots(
 
 
 def draw_innovations(axes: Axes, result: AxisComparison) -> None:
-    """Draw the innovations of KF and EKF2 with ±2√S."""
-    plot_limit_m, ekf2_innovations = _find_innovation_limit_m(result), result.ekf2_innovations
-    updates, kf_innovations = result.kf_run.updates, result.kf_run.updates["innovation_m"]
-    draw_sigma_band(axes, 0.0 * kf_innovations, np.sqrt(updates["innovation_variance_m2"]))
+    """Draw the innovations of all filters with ±2√S; KF, with a shaded band, is in front."""
+    plot_limit_m = _find_innovation_limit_m(result)
     style.draw_zero_line(axes)
-    innovations_and_styles = [(kf_innovations, INNOVATION_STYLES["KF"])]
-    if isinstance(ekf2_innovations, pd.DataFrame):
-        two_sqrt_s_m = 2.0 * np.sqrt(ekf2_innovations["innovation_variance_m2"])
-        for limit in (two_sqrt_s_m, -two_sqrt_s_m):
-            draw_curve(axes, limit, **TRACK_STYLES["EKF2"])
-        is_rejected = ekf2_innovations["rejected"] > 0
-        innovations = ekf2_innovations["innovation_m"]
-        innovations_and_styles = [
-            (innovations[~is_rejected], INNOVATION_STYLES["EKF2"]),
-            (innovations[is_rejected], REJECTED_STYLE),
-            *innovations_and_styles,
-        ]
-    for values, marker_style in innovations_and_styles:
-        draw_dots(axes, values, plot_limit_m, marker_style)
+    for name, table in reversed(_collect_innovation_tables(result).items()):
+        innovations, sqrt_s_m = table["innovation_m"], np.sqrt(table["innovation_variance_m2"])
+        if name == "KF":
+            draw_sigma_band(axes, 0.0 * innovations, sqrt_s_m)
+        else:
+            for limit in (2.0 * sqrt_s_m, -2.0 * sqrt_s_m):
+                draw_curve(axes, limit, **TRACK_STYLES[name])
+        is_rejected = table.get("rejected", 0.0 * innovations) > 0
+        draw_dots(axes, innovations[~is_rejected], plot_limit_m, INNOVATION_STYLES[name])
+        if "rejected" in table:
+            draw_dots(axes, innovations[is_rejected], plot_limit_m, REJECTED_STYLE)
     axes.set_ylim(-1.04 * plot_limit_m, 1.04 * plot_limit_m)
 
 
 def _describe_innovations(result: AxisComparison) -> str:
     sentences = []
-    for name, consistency in get_statistics_by_filter(result).items():
+    for name, consistency in result.filters.items():
+        label = FILTER_NAMES[name]
         if isinstance(consistency, Unavailable):
-            sentences.append(f"{name}: {consistency.reason}.")
+            sentences.append(f"{label}: {consistency.reason}.")
             continue
         verdict_text = format_sigma_verdict(consistency.verdict, consistency.sigma_error_factor)
         sentences.append(
-            f"{name}: {consistency.count} innovations, {verdict_text}; mean "
+            f"{label}: {consistency.count} innovations, {verdict_text}; mean "
             f"{consistency.innovation_mean_m:+.3f} m, standard deviation "
             f"{consistency.innovation_std_m:.3f} m, median √S {consistency.sqrt_s_median_m:.3f} m."
         )
-    if isinstance(result.ekf2_state, Unavailable):
-        sentences.append(f"EKF2: {result.ekf2_state.reason}.")
-    plot_limit_m, innovation_tables = (
-        _find_innovation_limit_m(result),
-        _collect_innovation_tables(result),
-    )
-    if any(
-        table["innovation_m"].abs().max() > plot_limit_m for table in innovation_tables.values()
-    ):
+    plot_limit_m, tables = _find_innovation_limit_m(result), _collect_innovation_tables(result)
+    if any(table["innovation_m"].abs().max() > plot_limit_m for table in tables.values()):
         sentences.append("Triangles: values outside the plot.")
-    if isinstance(result.ekf2_innovations, pd.DataFrame):
-        rejected_count = int((result.ekf2_innovations["rejected"] > 0).sum())
-        if rejected_count:
-            sentences.append(f"EKF2 rejected {rejected_count} positions (hollow dots).")
+    for label, table in tables.items():
+        if "rejected" in table and (rejected_count := int((table["rejected"] > 0).sum())):
+            sentences.append(f"{label} rejected {rejected_count} positions (hollow dots).")
     return " ".join(sentences)
 
 
@@ -355,8 +354,7 @@ def _format_fraction_outside(result: AxisComparison) -> str:
 
 
 def _draw_sigma(axes: Axes, result: AxisComparison, quantity: QuantityColumns) -> None:
-    variance_tables = select_available_tables(KF=result.kf_run.steps, EKF2=result.ekf2_variance)
-    for name, table in variance_tables.items():
+    for name, table in _select_available_tables(result, lambda tracks: tracks.variance).items():
         draw_curve(axes, np.sqrt(table[quantity.variance_column]), **TRACK_STYLES[name])
     set_log_scale(axes)
 

@@ -57,12 +57,11 @@ def format_sigma_verdict(verdict: str, factor: float) -> str:
 
 
 def get_statistics_by_filter(result: AxisComparison) -> dict[str, FilterSummary | UntestedFilter]:
-    """Return the consistency statistics of KF and, if logged, EKF2."""
-    is_ekf2_missing = isinstance(result.ekf2_state, Unavailable)
+    """Return the consistency statistics of each filter, of EKF2 only if it is logged."""
     return {
         FILTER_NAMES[name]: statistics
         for name, statistics in result.filters.items()
-        if not (name == "ekf2" and is_ekf2_missing)
+        if not isinstance(result.tracks[name].state, Unavailable)
     }
 
 

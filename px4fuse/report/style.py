@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.arrays import Array
 
 if TYPE_CHECKING:
@@ -27,7 +28,6 @@ TIME_LABEL = "time since first sample (s)"
 KF_COLOUR = "#12407f"
 KF_BAND_COLOUR = "#d0d9e6"
 EKF2_COLOUR = "#b85400"
-EKF2_BAND_COLOUR = "#f0dccd"
 TRUTH_COLOUR = "#111111"
 MEASUREMENT_COLOUR = "#9a9a9a"
 TEXT_COLOUR = "#000000"
@@ -53,6 +53,7 @@ def dot_style(
     return {"color": colour, "marker": marker, "ms": size, "mew": edge_width, "ls": "none"}
 
 
+# Styles of each filter
 TRACK_STYLES = {
     "KF": line_style(KF_COLOUR, 1.0),
     "EKF2": line_style(EKF2_COLOUR, 1.1, (0, (4, 1.6))),
@@ -62,10 +63,12 @@ INNOVATION_STYLES = {
     "KF": dot_style(KF_COLOUR, "o", 2.0),
     "EKF2": dot_style(EKF2_COLOUR, "s", 2.2),
 }
+INNOVATION_SIGNS = {"KF": "●", "EKF2": "■"}  # in texts
+SIGMA_BAND_COLOURS = {"KF": KF_BAND_COLOUR, "EKF2": "#f0dccd"}
+FILTER_COLOURS = {name: TRACK_STYLES[label]["color"] for name, label in FILTER_NAMES.items()}
 # Rejected innovations of EKF2 are hollow
 REJECTED_STYLE = dot_style(EKF2_COLOUR, "s", 2.8, 0.6) | {"mfc": "white"}
 MEASUREMENT_STYLE = dot_style(MEASUREMENT_COLOUR, ".", 1.8)
-SIGMA_BAND_COLOURS = {"KF": KF_BAND_COLOUR, "EKF2": EKF2_BAND_COLOUR}
 
 MAX_DRAWN_POINTS = 1000  # maximum per curve
 

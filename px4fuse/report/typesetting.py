@@ -11,6 +11,7 @@ import typst
 
 from px4fuse.report import fonts
 from px4fuse.report.page import Page, to_typst_data
+from px4fuse.report.style import FILTER_COLOURS
 
 # PDF/A-3a for archives, PDF/UA-1 for screen readers
 PDF_STANDARDS: list[Any] = ["a-3a", "ua-1"]
@@ -55,5 +56,9 @@ def _open_compiler(report: Mapping[str, Any]) -> Iterator[typst.Compiler]:
             ),
             package_path=empty_folder,
             package_cache_path=empty_folder,
-            sys_inputs={"data": json.dumps({**report, "fonts": font_names})},
+            sys_inputs={
+                "data": json.dumps(
+                    {**report, "fonts": font_names, "filter_colours": FILTER_COLOURS}
+                )
+            },
         )
