@@ -199,13 +199,14 @@ def collect_examples() -> dict[str, ExampleFlight]:
         find_loop_findings(px4fuse.close_loop(odometry, closures=TRUE)),
         "simulated odometry of three laps",
     )
-    heading_parts = [
+    heading_errors_of_parts = [
         HeadingPart(2.0 * n, 2.0 * n + 2.0, angle_deg, 1.0)
         for n, angle_deg in enumerate((-36.0, -20.0, -9.0))
     ]
     aisle_analysis = unexplained(compare(aisle_flight(duration_s=20.0), axes=("north",)))
     drift_analysis = replace(
-        aisle_analysis, heading=combine_heading_parts(tuple(heading_parts), 1e-9, "positions")
+        aisle_analysis,
+        heading=combine_heading_parts(tuple(heading_errors_of_parts), 1e-9, "positions"),
     )
     add_examples(source_frame.detect(drift_analysis), "a heading estimate with simulated drift")
     flight = aisle_flight(duration_s=60.0)
@@ -244,7 +245,7 @@ def find_detector_modules() -> dict[str, str]:
             if isinstance(node, ast.Constant) and node.value in FINDING_TITLES:
                 module_by_id.setdefault(str(node.value), path.stem)
     # Modules whose finding ids are no literals, because they are composed of a name and a suffix
-    module_by_composed_id = {
+    module_by_id_with_known_prefix = {
         name: stem
         for name in FINDING_TITLES
         for stem, prefixes in {
@@ -253,7 +254,7 @@ def find_detector_modules() -> dict[str, str]:
         }.items()
         if name.startswith(prefixes)
     }
-    return module_by_id | module_by_composed_id
+    return module_by_id | module_by_id_with_known_prefix
 
 
 def is_numeric_literal(expression: ast.expr) -> bool:

@@ -101,7 +101,7 @@ class WhatIfAnalysis:
     """
 
     flight: Flight
-    whatif: WhatIf
+    statistics: WhatIf
     changes: Mapping[str, float]
     uses_estimates: bool
     without: Mapping[str, float] = field(default_factory=dict)

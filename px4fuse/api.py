@@ -343,7 +343,7 @@ def what_if(
     """
     flight = log if isinstance(log, Flight) else read_log(log)
     if changes is None and not without:
-        return run_what_if(request.WhatIfRequest(log=flight.log.name), flight=flight).whatif
+        return run_what_if(request.WhatIfRequest(log=flight.log.name), flight=flight).statistics
     ekf2_model = require_available(prepare_ekf2_model(flight), flight)
     change_sets = changes if isinstance(changes, Sequence) else [changes or {}]
     return require_available(whatif.what_if(ekf2_model, change_sets, without or {}), flight)

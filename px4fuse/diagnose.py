@@ -261,15 +261,15 @@ def prepare_comparison(
         )
     if not time_offset.is_significant(time_offset.remaining_s):
         # Time offset (s) that prepare_comparison_inputs has already applied to the timestamps
-        applied_s = time_offset.applied_s
-        low_s, high_s = (limit_s - applied_s for limit_s in time_offset.interval_s)
+        applied_offset_s = time_offset.applied_s
+        low_s, high_s = (limit_s - applied_offset_s for limit_s in time_offset.interval_s)
         notes = [
             *prepared_comparison.notes,
             f"--clock-offset auto: the time offset {time_offset.remaining_s:+.3f} s (95 % "
             f"{low_s:+.3f} to {high_s:+.3f} s) is not significant and not applied",
         ]
-        if applied_s:
-            notes.append(f"the timestamps were shifted by {applied_s:+.3f} s")
+        if applied_offset_s:
+            notes.append(f"the timestamps were shifted by {applied_offset_s:+.3f} s")
         return replace(prepared_comparison, notes=tuple(notes))
     request = structs.replace(request, clock_offset_s=time_offset.offset_s)
     return prepare_comparison_inputs(flight, request)
@@ -313,7 +313,9 @@ def diagnose_or_check_aids(
         As in :func:`diagnose`, or the log contains neither positions nor EKF2's innovations.
     """
     flight = flight or read_flight(request, progress)
-    if request.position_source or any(track.origin.is_auto_candidate for track in flight.positions):
+    if request.position_source or any(
+        track.origin.is_selectable_by_default for track in flight.positions
+    ):
         return diagnose(request, progress, flight)
     missing_data, aids = explain_missing_source(flight), evaluate_aids(flight)
     if isinstance(aids, Unavailable):

@@ -40,7 +40,7 @@ def run_aisle_example() -> KfRun:
     return run_kf(axis, settings)
 
 
-def format_kalman_lines() -> Iterator[str]:
+def format_kalman_example_lines() -> Iterator[str]:
     """Yield the lines of Example 1: the state after each UWB update."""
     kf_run = run_aisle_example()
     for index, state in kf_run.steps.loc[kf_run.updates.index].iterrows():
@@ -53,7 +53,7 @@ def format_kalman_lines() -> Iterator[str]:
         )
 
 
-def format_loop_lines() -> Iterator[str]:
+def format_loop_example_lines() -> Iterator[str]:
     """Yield the lines of Example 2: the loop closure error, and the five corrected corners."""
     odometry = np.array(ODOMETRY_CORNERS_M)
     distance_m = cumulative_distance(odometry)

@@ -351,7 +351,7 @@ def unexplained(comparison: Comparison, tuning: TuningByAxis | None = None) -> A
         tuning=tuning or {}, time_offset=missing, heading=missing, systematic_errors=missing,
         source_low_pass=missing, time_correlated_noise=missing,
         axis_tunings=tune_perpendicular_axes(comparison),
-        noisy_part=find_noisy_flight_part(comparison, (tuning or {}).get(HORIZONTAL)),
+        noisy_flight_part=find_noisy_flight_part(comparison, (tuning or {}).get(HORIZONTAL)),
         imu_oscillation=find_imu_oscillation(comparison),
     )  # fmt: skip
     trials = rerun_filters(comparison, estimates, missing)

@@ -153,7 +153,7 @@ def test_answers_option_of_compare_prints_answer_form_in_report(
     reader = PdfReader(report)
     results = read_results(reader.attachments["results.json"][0])
     assert isinstance(results, ComparisonResults)
-    assert results.student.answers.states_no_fault  # type: ignore[union-attr]
+    assert results.student.answers.declares_no_fault  # type: ignore[union-attr]
     assert any("Answer form" in page.extract_text() for page in reader.pages)
 
 

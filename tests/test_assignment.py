@@ -24,8 +24,8 @@ from px4fuse.classroom.assignment.assignment import (
 from px4fuse.classroom.assignment.key import AnswerKey, format_answer_key, read_answer_key
 from px4fuse.classroom.assignment.random_assignment import (
     ASSIGNABLE_FAULTS,
+    DIFFICULT_FAULTS_PROBABILITY,
     EASIEST_DIFFICULTY,
-    HARD_FAULTS_PROBABILITY,
     HARDEST_DIFFICULTY,
     LOOP_PROBABILITY,
     MAX_FAULT_DIFFICULTY,
@@ -197,7 +197,9 @@ class TestDraw:
         counts, _ = np.histogram(each, bins=4, range=(EASIEST_DIFFICULTY, HARDEST_DIFFICULTY))
         assert counts.min() > 65
         undetectable_count = sum(one > HARDEST_DIFFICULTY for one in each)
-        assert undetectable_count / len(each) == pytest.approx(HARD_FAULTS_PROBABILITY, abs=0.06)
+        assert undetectable_count / len(each) == pytest.approx(
+            DIFFICULT_FAULTS_PROBABILITY, abs=0.06
+        )
 
     def test_assignment_flight_seeds_have_128_bits(self):
         seeds = [assign_random_flight(SECRET, f"s{n}", "aisle").scenario.seed for n in range(50)]

@@ -437,7 +437,9 @@ def test_read_ekf2_covariance_drops_negative_variance(tmp_path):
     states = log["estimator_states"]
     states["states"][:, 0] = 1.0
     states["covariances"][2, 7] = -1e-9
-    assert len(write_and_read(log, tmp_path).ekf2.record.delayed) == len(states["timestamp"]) - 1
+    assert (
+        len(write_and_read(log, tmp_path).ekf2.record.delayed_state) == len(states["timestamp"]) - 1
+    )
 
 
 def test_info_command_shows_no_rate_for_a_single_sample(tmp_path):

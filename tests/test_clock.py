@@ -44,7 +44,7 @@ from px4fuse.filter.fitting import NoiseParameters
 from px4fuse.filter.imu_motion import (
     INITIAL_STATE_PRIOR_PRECISIONS,
     INTEGRATION_STEP_S,
-    PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS,
+    PRIOR_SIGMAS_OF_CONSTANT_ERRORS,
     SegmentMotion,
     compute_imu_motion,
     make_segment_motion,
@@ -112,10 +112,10 @@ def level_signals(
 def test_imu_error_sensitivities_at_rest_equal_closed_form() -> None:
     signals = level_signals()
     t, g = signals.time_s - signals.time_s[0], GRAVITY[2]
-    motion = np.moveaxis(signals.motion_and_derivatives, -1, 0)
+    motion = np.moveaxis(signals.motion_and_imu_error_derivatives, -1, 0)
     speed = motion[:, 1]
     value = np.diff(speed, axis=0) / INTEGRATION_STEP_S
-    assert motion.shape == (len(t), 2, 3, len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS))
+    assert motion.shape == (len(t), 2, 3, len(PRIOR_SIGMAS_OF_CONSTANT_ERRORS))
     np.testing.assert_allclose(motion[..., 0], 0.0, atol=1e-10)
     # tilt θ about north and east moves it sideways by θ × f, f = [0, 0, -g]; heading does not
     tilted = np.tile([[0, -g, 0], [g, 0, 0], [0, 0, 0]], (len(value), 1, 1))
@@ -135,7 +135,7 @@ def test_imu_integration_at_constant_yaw_rate_gives_a_circle() -> None:
     signals = level_signals((0.0, sideways, 0.0), turn=omega, interval=0.004)
     t, middle = signals.time_s, omega * (signals.time_s + np.diff(signals.time_s)[0] / 2.0)
     circle = sideways * np.stack([-np.sin(middle), np.cos(middle), 0.0 * t], 1)
-    velocity = signals.motion_and_derivatives[1, :, 0].T
+    velocity = signals.motion_and_imu_error_derivatives[1, :, 0].T
     acceleration = np.diff(velocity, axis=0) / INTEGRATION_STEP_S
     np.testing.assert_allclose(acceleration, circle[:-1], atol=2e-5)
     round_it = np.stack([np.cos(omega * t), np.sin(omega * t)], 1)
@@ -159,7 +159,7 @@ def test_integrated_constant_acceleration_equals_closed_form() -> None:
     assert moved.time_s[[0, -1]] == pytest.approx([0.75, 79.25])
     positions = moved.make_positions_and_increments(np.array([-0.3, 0.0, 0.21]))
     way, speed = positions.delta_position_m, positions.delta_velocity_m_s
-    assert way.shape == (2, 3, 1 + len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS), len(moved.time_s) - 1)
+    assert way.shape == (2, 3, 1 + len(PRIOR_SIGMAS_OF_CONSTANT_ERRORS), len(moved.time_s) - 1)
     inside = np.flatnonzero(positions.is_within_segment)
     np.testing.assert_allclose(way[0, :, 0], 0.0, atol=1e-9)
     np.testing.assert_allclose(way[1, :, 0, inside], 1.5 * 0.25**2 / 2.0, atol=1e-9)
@@ -279,7 +279,7 @@ def test_time_offset_likelihood_equals_joint_normal_density(exact_imu) -> None:
     noises = np.log([found.sigma_a_m_s2, found.sigma_z_m])
     within = [24, 60, 90]
     costs = []
-    for offset in found.curve_time_offsets_s[within]:
+    for offset in found.likelihood_curve_offsets_s[within]:
         normals = [JointNormal(*segment, offset) for segment in segments]
 
         def cost(logs: Array, normals: list[JointNormal] = normals) -> float:
@@ -509,7 +509,7 @@ def stated(
     curve = np.array([0.0])
     return SourceTimeOffset(
         offset_s=middle, interval_s=(middle - 0.02, middle + 0.02), sigma_s=0.01, applied_s=0.0,
-        is_determinable=True, curve_time_offsets_s=curve, curve_log_likelihood_drops=curve,
+        is_determinable=True, likelihood_curve_offsets_s=curve, curve_log_likelihood_drops=curve,
         parts=parts,
         drift_ppm=100.0, drift_sigma_ppm=50.0, change_p_value=change_p_value, sigma_a_m_s2=0.2,
         sigma_z_m=0.01, count=3000,

@@ -260,7 +260,7 @@ CONVENTION_FAULTS = {
 
 def compared(track: PositionTrack) -> Comparison:
     """Return the prepared comparison of a flight that EKF2 flew with other positions."""
-    usual = [one for one in flown().positions if not one.origin.is_auto_candidate]
+    usual = [one for one in flown().positions if not one.origin.is_selectable_by_default]
     return prepare(replace(flown(), positions=(track, *usual)))
 
 

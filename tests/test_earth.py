@@ -10,7 +10,7 @@ from findings_tools import made
 from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
 from px4fuse.ekf2.replay_segments import (
     compute_earth_rate_rad_s,
-    compute_internal_to_published_ratio,
+    compute_internal_to_published_position_ratio,
 )
 from px4fuse.flight.model import FusionRecord
 from px4fuse.readers.px4_positions import EARTH_RADIUS_M
@@ -25,7 +25,7 @@ ECCENTRICITY2 = 0.00669438
 
 def record(latitude_deg: float, altitude_m: float = 0.0, north_m: float = np.nan) -> FusionRecord:
     known = {"latitude_deg": latitude_deg, "altitude_m": altitude_m}
-    return made(FusionRecord, **known, delayed=pd.DataFrame({"north_m": [north_m]}))
+    return made(FusionRecord, **known, delayed_state=pd.DataFrame({"north_m": [north_m]}))
 
 
 @pytest.mark.parametrize("latitude_deg", DEGREE_M)
@@ -35,17 +35,17 @@ def test_metres_per_degree_use_curvature_radii_of_ekf2(latitude_deg: float) -> N
     latitude = np.radians(latitude_deg)
     of_degree = np.radians(1.0) * EARTH_RADIUS_M
     too_long = 1.0 / (1.0 - ECCENTRICITY2 * np.sin(latitude) ** 2)
-    north, east, down = compute_internal_to_published_ratio(record(latitude_deg))
+    north, east, down = compute_internal_to_published_position_ratio(record(latitude_deg))
     assert north * of_degree == pytest.approx(north_m * too_long, rel=2e-5)
     assert east * of_degree * np.cos(latitude) == pytest.approx(east_m, rel=2e-5)
     assert down == 1.0
-    higher = compute_internal_to_published_ratio(record(latitude_deg, 637.1))
+    higher = compute_internal_to_published_position_ratio(record(latitude_deg, 637.1))
     assert np.subtract(higher, (north, east, down)) == pytest.approx([1e-4, 1e-4, 0.0], abs=1e-12)
 
 
 def test_ekf2_projection_scale_without_gnss_origin_is_1() -> None:
-    assert compute_internal_to_published_ratio(record(45.0, north_m=3.0)) == 1.0
-    assert compute_internal_to_published_ratio(record(np.nan)) == 1.0
+    assert compute_internal_to_published_position_ratio(record(45.0, north_m=3.0)) == 1.0
+    assert compute_internal_to_published_position_ratio(record(np.nan)) == 1.0
 
 
 def test_earth_rotation_rate_matches_sidereal_day() -> None:
@@ -63,7 +63,7 @@ def test_ekf2_model_of_gnss_flight_includes_earth_rotation() -> None:
     assert SIMULATED_EKF2_NOTE in flight.log.notes
     flat, round_ = opened(flight), opened(replace(flight, log=replace(flight.log, notes=())))
     known = flight.ekf2.record
-    metres = compute_internal_to_published_ratio(known)
+    metres = compute_internal_to_published_position_ratio(known)
     assert metres == pytest.approx((1.00357, 1.00302, 1.0), abs=1e-5)
     flat_m, round_m = (found.inputs.received_positions.position_m for found in (flat, round_))
     np.testing.assert_allclose(round_m, flat_m * metres)

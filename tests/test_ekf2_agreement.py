@@ -184,8 +184,8 @@ def test_correlation_of_constant_innovations_is_unavailable():
 
 
 def test_ekf2_replay_heading_error_without_logged_state_is_none():
-    delayed = pd.DataFrame(index=pd.Index([1.0]))
-    ekf2 = made(Ekf2, record=made(FusionRecord, delayed=delayed))
+    delayed_state = pd.DataFrame(index=pd.Index([1.0]))
+    ekf2 = made(Ekf2, record=made(FusionRecord, delayed_state=delayed_state))
     replay = SimpleNamespace(
         settings={"EKF2_MAG_NOISE": 0.05}, find_evaluated_spans=lambda: ((5.0, 9.0),)
     )

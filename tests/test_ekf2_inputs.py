@@ -124,12 +124,12 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
 
     def prepared(
         interval_s: float = 0.008, horizon_s: Any = 0.1, firmware: str = "PX4 v1.16.1",
-        fusing: Any = NONE, stores_bias_increments: bool = False, without: Any = (),
+        fusing: Any = NONE, has_delta_angle_biases: bool = False, without: Any = (),
         **parameters: float,
     ) -> Any:  # fmt: skip
         record = made(
             FusionRecord, parameters=parameters, other_horizontal_aids=(),
-            stores_bias_increments=stores_bias_increments, flow=pd.DataFrame(),
+            has_delta_angle_biases=has_delta_angle_biases, flow=pd.DataFrame(),
         )  # fmt: skip
         ekf2 = made(
             Ekf2, record=record, innovations={"north": pd.DataFrame({"rejected": []})},
@@ -149,8 +149,8 @@ def test_ekf2_fusion_rules_are_those_of_logged_px4_release(flown):
     assert new.rules == FusionRules(0.2, 0.4, 1.0, 5, None, False)
     assert new.imu_offset_m.tolist() == [0.0, 0.25, 0.0]
     assert (new.mean_step_s, new.configured_step_s) == (0.01, 0.01)
-    assert (new.horizon_s, new.max_fusion_interval_in_gap_s) == (0.1, 0.25)
-    old = flown(EKF2_AID_MASK=8.0, stores_bias_increments=True)
+    assert (new.horizon_s, new.max_height_fusion_interval_in_position_gap_s) == (0.1, 0.25)
+    old = flown(EKF2_AID_MASK=8.0, has_delta_angle_biases=True)
     assert old.rules == FusionRules(math.inf, 7.0, 7.0, 1_000_000, pytest.approx(5e-4), True)
     assert old.settings["EKF2_EV_DELAY"] == 175.0
     assert flown(EKF2_PREDICT_US=8000.0).configured_step_s == pytest.approx(0.008)
@@ -333,15 +333,15 @@ def turning(states: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame, Ekf2, Fusio
     imu[Columns.SPECIFIC_FORCE] = [1.0, 0.2, -9.8]
     attitude = pd.DataFrame(facing(time[::4]), index=time[::4], columns=Columns.QUATERNION)
     turned = facing(states, 0.1 * (states - 10.0))
-    delayed = pd.DataFrame(turned, index=states, columns=Columns.QUATERNION)
-    delayed = delayed.assign(**dict.fromkeys(Columns.VELOCITY, 2.0), **{
+    delayed_state = pd.DataFrame(turned, index=states, columns=Columns.QUATERNION)
+    delayed_state = delayed_state.assign(**dict.fromkeys(Columns.VELOCITY, 2.0), **{
         **dict.fromkeys(Columns.POSITION, np.nan), **dict.fromkeys(Columns.GYRO_BIAS, 0.0),
         **dict.fromkeys(Columns.ACCELEROMETER_BIAS, 0.2), Columns.GYRO_BIAS[2]: 0.01,
         **{name: 1.0 + n for n, name in enumerate(Columns.FUSION_HORIZON_VARIANCE)},
     })  # fmt: skip
-    delayed["attitude_down_rad2"] = states
+    delayed_state["attitude_down_rad2"] = states
     state = pd.DataFrame(7.0, index=time, columns=Columns.STATE).assign(down_m=time)
-    record = made(FusionRecord, delayed=delayed, parameters={}, status_flags={})
+    record = made(FusionRecord, delayed_state=delayed_state, parameters={}, status_flags={})
     return imu, attitude, made(Ekf2, state=state), record
 
 
@@ -366,7 +366,7 @@ def test_ekf2_replay_inputs_equal_motion_of_rotating_vehicle():
     assert_allclose(found.down_m, steps)
     assert_allclose(found.attitude_error_rad[:, 2], 0.05 + 0.1 * (steps - 10.5), atol=1e-6)
     assert found.starts_while_fusing
-    flown[3].delayed[Columns.POSITION] = 3.0
+    flown[3].delayed_state[Columns.POSITION] = 3.0
     assert_allclose(_make_segment(*flown, 5, 11.5).state[6:9], [3.0, 3.0, 10.5])
 
 
@@ -376,22 +376,22 @@ def segments(monkeypatch, **parts: Any) -> list[tuple[float, float]]:
     tenths = np.arange(0.0, 60.0, 0.1)
     usual = {
         "imu": np.arange(0.0, 60.0, 0.01), "vision": tenths, "fused": tenths, "airborne": NONE,
-        "delayed": tenths[::5], "primary_instances": ((-np.inf, 0),),
+        "delayed_state": tenths[::5], "primary_instances": ((-np.inf, 0),),
     }  # fmt: skip
     given = SimpleNamespace(**{**usual, **parts})
 
     def keep(*inputs: Any) -> ReplaySegment:
         *_, record, at, high = inputs
-        found.append((float(record.delayed.index[at]), round(float(high), 2)))
+        found.append((float(record.delayed_state.index[at]), round(float(high), 2)))
         return made(ReplaySegment, **dict.fromkeys(map(attrgetter("name"), fields(ReplaySegment))))
 
     monkeypatch.setattr("px4fuse.ekf2.replay_segments._make_segment", keep)
     monkeypatch.setattr("px4fuse.ekf2.replay_segments.CORRELATION_ESTIMATION_TIME_S", 0.0)
-    imu, fused, delayed = (
-        pd.DataFrame(index=each) for each in (given.imu, given.fused, given.delayed)
+    imu, fused, delayed_state = (
+        pd.DataFrame(index=each) for each in (given.imu, given.fused, given.delayed_state)
     )
     ekf2 = made(Ekf2, innovations={"north": fused}, primary_instances=given.primary_instances)
-    record = made(FusionRecord, delayed=delayed)
+    record = made(FusionRecord, delayed_state=delayed_state)
     find_replay_segments(
         made(Flight, airborne=given.airborne), imu, imu, ekf2, record, given.vision, is_gnss=False
     )

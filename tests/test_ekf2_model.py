@@ -225,9 +225,9 @@ def test_ekf2_model_fuses_vision_height_if_enabled(model: Ekf2Model, sample_flig
 
 def test_ekf2_model_with_constant_accelerometer_bias_is_finite(sample_flight: Flight) -> None:
     record = sample_flight.ekf2.record
-    fixed = record.delayed.copy()
+    fixed = record.delayed_state.copy()
     fixed.loc[:, [name for name in fixed if str(name).endswith("m2_s4")]] = 0.0
     parameters = {**record.parameters, "EKF2_ACC_B_NOISE": 0.0}
-    made = opened(with_record(sample_flight, delayed=fixed, parameters=parameters))
+    made = opened(with_record(sample_flight, delayed_state=fixed, parameters=parameters))
     assert np.isfinite(made.baseline_replay.published_state.to_numpy()).all()
     assert np.isfinite(made.baseline_replay.updates.to_numpy()).all()

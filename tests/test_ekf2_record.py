@@ -28,13 +28,15 @@ def made_log(generation, position=True):
 def test_read_ekf2_states_layout_is_equal_for_each_px4_release(read, generation):
     ekf2 = read(made_log(generation, position=generation != "v1.16")).ekf2
     record = ekf2.record
-    assert list(record.delayed) == Columns.FUSION_HORIZON_STATE + Columns.FUSION_HORIZON_VARIANCE
-    row = record.delayed.iloc[3]
+    assert (
+        list(record.delayed_state) == Columns.FUSION_HORIZON_STATE + Columns.FUSION_HORIZON_VARIANCE
+    )
+    row = record.delayed_state.iloc[3]
     assert row[Columns.QUATERNION].to_numpy() == pytest.approx(QUATERNION)
     assert row["north_m_s"] == pytest.approx(0.5)
     assert row["down_m"] == pytest.approx(-1.5)
     old = generation in ("v1.12", "v1.14")
-    assert record.stores_bias_increments == old
+    assert record.has_delta_angle_biases == old
     per = ekf2.step_s if old else 1.0
     assert row[Columns.GYRO_BIAS].to_numpy() == pytest.approx(np.array([1, 2, 3]) * 1e-4 / per)
     bias = row[Columns.ACCELEROMETER_BIAS].to_numpy()
@@ -57,7 +59,9 @@ def test_attitude_variance_equals_variance_of_sampled_angles(read):
     log = made_log("v1.14")
     variance = np.array([1e-5, 4e-5, 2e-5, 3e-5])
     log["estimator_states"]["covariances"][:, :4] = variance
-    found = read(log).ekf2.record.delayed.iloc[0][Columns.FUSION_HORIZON_VARIANCE[:3]].to_numpy()
+    found = (
+        read(log).ekf2.record.delayed_state.iloc[0][Columns.FUSION_HORIZON_VARIANCE[:3]].to_numpy()
+    )
     rng = np.random.default_rng(7)
     drawn = QUATERNION + rng.normal(0.0, np.sqrt(variance), (200_000, 4))
     truth = Rotation.from_quat(QUATERNION, scalar_first=True)

@@ -80,7 +80,7 @@ def test_vision_measurements_apply_lever_arm_and_noise_minimum():
 def deciding(
     *,
     action: int = FUSE,
-    can_start: bool = False,
+    can_start_fusion: bool = False,
     has_gate: bool = True,
     follows_log: bool = False,
     logged: float = np.nan,
@@ -95,7 +95,7 @@ def deciding(
     """Return rejected, fused and reset at 10 s; then last fusion, stopped, remaining resets."""
     fusion = _FusionDecisions(
         rules, 10.0 - gap_s, sample_actions=np.array([[action]]),
-        can_start=np.array([[can_start]]),
+        can_start_fusion=np.array([[can_start_fusion]]),
         time_s=np.array([[10.0]]), has_gate=np.array([has_gate]),
         uses_logged_decisions=np.array([follows_log]),
         logged_rejected_flags=np.array([logged]), logged_resets=np.array([logged_reset]),
@@ -118,7 +118,7 @@ def deciding(
     ({"has_gate": False}, (False, True, False, 10.0, False, 5)),
     ({"action": START_FUSION, "left": 2}, (False, False, True, 10.0, False, 5)),
     ({"stopped": True, "outside": False}, (False, False, False, 9.5, True, 5)),
-    ({"stopped": True, "can_start": True, "left": 0}, (True, False, True, 10.0, False, 5)),
+    ({"stopped": True, "can_start_fusion": True, "left": 0}, (True, False, True, 10.0, False, 5)),
     ({"action": NO_ACTION}, (False, False, False, 9.5, False, 5)),
     # logged decisions
     ({"follows_log": True, "logged": 0.0}, (False, True, False, 10.0, False, 5)),
@@ -144,7 +144,7 @@ def test_ekf2_model_stops_fusion_and_resets_after_ekf2_timeouts(case, expected):
 ])  # fmt: skip
 def test_fusion_horizon_delay_equals_duration_of_ekf2_buffer(settings, by_delay, timing):
     usual = {"EKF2_EV_DELAY": 0.0, "EKF2_DELAY_MAX": 200.0}
-    rules = replace(RULES, is_horizon_largest_delay=by_delay)
+    rules = replace(RULES, is_horizon_set_by_largest_delay=by_delay)
     inputs = made(
         ReplayInputs,
         rules=rules,
@@ -160,7 +160,7 @@ def test_fusion_horizon_delay_equals_duration_of_ekf2_buffer(settings, by_delay,
 
 
 def test_what_if_with_ekf2_delay_max_on_px4_v1_14_raises_error():
-    rules = replace(RULES, is_horizon_largest_delay=True)
+    rules = replace(RULES, is_horizon_set_by_largest_delay=True)
     received = made(ReceivedPositions, uses_sender_timestamps=False)
     inputs = made(ReplayInputs, rules=rules, settings={}, aid=EV_POS, received_positions=received)
     flight = SimpleNamespace(log=log(firmware="PX4 v1.14"))
@@ -469,7 +469,7 @@ def test_vision_fusion_start_and_stop_depend_on_sample_interval():
     # 0.4 s to the previous step
     assert acting([10.1, 10.5, 10.6]) == [FUSE, FUSE, FUSE]
     assert acting([10.1, 10.53, 10.6]) == [FUSE, NO_ACTION, START_FUSION]
-    old = replace(RULES, start_interval_s=math.inf, stop_timeout_s=7.0)
+    old = replace(RULES, max_sample_interval_to_start_s=math.inf, stop_timeout_s=7.0)
     assert acting([10.1, 12.0, 14.9], fusing=False, rules=old) == [NO_ACTION, START_FUSION, FUSE]
 
 
@@ -481,7 +481,7 @@ def events(
         received_positions=vision_of(stamps, age_s),
         mean_step_s=0.01,
         rules=RULES,
-        max_fusion_interval_in_gap_s=0.25,
+        max_height_fusion_interval_in_position_gap_s=0.25,
     )
     return _make_events(inputs, stretch_of(100), FusionDelays(delay_s, horizon_s))
 

@@ -232,7 +232,7 @@ def test_delay_above_ekf2_delay_max_adds_a_note():
         (True, -np.inf, "Without logged arrival times"),
         (True, 0.0, None),
     ):
-        rules = replace(RULES, is_horizon_largest_delay=by_delay)
+        rules = replace(RULES, is_horizon_set_by_largest_delay=by_delay)
         arrivals = SimpleNamespace(arrival_s=np.full(3, arrival_s))
         inputs = SimpleNamespace(rules=rules, received_positions=arrivals)
         model: Any = SimpleNamespace(inputs=inputs)
@@ -247,7 +247,7 @@ def test_delay_above_ekf2_delay_max_adds_a_note():
 
 def test_what_if_with_late_samples_adds_a_note():
     for by_delay, remedy in ((False, ". Increase EKF2_DELAY_MAX"), (True, "")):
-        rules = replace(RULES, is_horizon_largest_delay=by_delay)
+        rules = replace(RULES, is_horizon_set_by_largest_delay=by_delay)
         arrivals = SimpleNamespace(arrival_s=np.zeros(3))
         inputs = SimpleNamespace(rules=rules, received_positions=arrivals)
         model: Any = SimpleNamespace(inputs=inputs)

@@ -11,7 +11,7 @@ from class_tools import graded_report
 from exchange import replace
 
 from px4fuse.classroom.assignment.roster import Person
-from px4fuse.classroom.grading.class_page import _make_points_inputs
+from px4fuse.classroom.grading.class_page import _make_points_input_boxes
 from px4fuse.classroom.grading.entries import (
     Course,
     add_time_zone,
@@ -305,7 +305,7 @@ def test_grades_download_includes_students_without_report(tmp_path) -> None:
     )
     grades, notes = make_grades({"1.pdf": TWO["1.pdf"]}, overrides=rows)
     again: dict[str, dict[str, GradeOverride]] = {}
-    for _, _, owner, boxes, kept in map(_make_points_inputs, grades):
+    for _, _, owner, boxes, kept in map(_make_points_input_boxes, grades):
         for item, points, comment in (*((a, c, d) for a, _, c, d in boxes), *kept):
             if points is not None or comment:
                 again.setdefault(owner, {})[item] = GradeOverride(points, comment)

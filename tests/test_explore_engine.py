@@ -19,7 +19,7 @@ from flights import Imu, Uwb, aisle_flight
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import shift_timestamps
 from px4fuse.explore.data import (
-    KF_INPUT_STEPS_PER_UNIT,
+    KF_INPUT_ROUNDING_STEPS_PER_UNIT,
     OFFSET_SLIDER_HALF_RANGE_S,
     ArrayEncoder,
     make_kf_inputs,
@@ -167,7 +167,11 @@ def test_javascript_unpack_restores_packed_arrays(engine: Browser) -> None:
     )
     for back, values in zip(unpacked, arrays, strict=False):
         # very large numbers have larger steps
-        step = 1.0 / KF_INPUT_STEPS_PER_UNIT if np.max(np.abs(values), initial=0.0) < 1e5 else 1e-6
+        step = (
+            1.0 / KF_INPUT_ROUNDING_STEPS_PER_UNIT
+            if np.max(np.abs(values), initial=0.0) < 1e5
+            else 1e-6
+        )
         np.testing.assert_allclose(back, values, rtol=0.0, atol=step)
     assert unpacked[-1] == [0.1, 0.2, 123.456789]
 

@@ -189,7 +189,7 @@ def test_default_source_is_gnss_only_if_ekf2_fused_it(tmp_path):
     # external vision is not reported as missing
     assert not [part for part in prepared.missing if "vision" in f"{part.reason} {part.remedy}"]
     never = flight_of(outdoors(fused=False), tmp_path)
-    assert not track_of(never).origin.is_auto_candidate
+    assert not track_of(never).origin.is_selectable_by_default
 
 
 @pytest.mark.parametrize(("eph_m", "least_m", "axes", "expected_m"), [
@@ -651,9 +651,12 @@ def test_gnss_driver_timestamp_replaces_delay_parameter(tmp_path):
     (0.0, {}, 1.0, True), (np.nan, {}, 2.0, True), (np.nan, {"EKF2_GPS_MODE": 0.0}, 2.0, False),
 ])  # fmt: skip
 def test_gnss_reset_rule_depends_on_px4_release(north_m, parameters, scale, with_velocity):
-    delayed = pd.DataFrame({"north_m": [north_m]})
+    delayed_state = pd.DataFrame({"north_m": [north_m]})
     record = made(
-        FusionRecord, parameters=parameters, stores_bias_increments=False, delayed=delayed
+        FusionRecord,
+        parameters=parameters,
+        has_delta_angle_biases=False,
+        delayed_state=delayed_state,
     )
     rules = _make_fusion_rules(record, 0.01, is_gnss=True)
     assert (rules.reset_variance_factor, rules.resets_velocity) == (scale, with_velocity)

@@ -249,7 +249,7 @@ def test_grade_command_applies_all_course_options(tmp_path, monkeypatch) -> None
     assert (course.title, processes) == ("Lab", 3)
     assert [person.student_id for person in course.roster] == ["0042"]
     assert course.worksheets[0].column_titles == ("id", "Grade")
-    assert (course.column, course.anonymous, course.attempt) == ("Grade", True, "best")
+    assert (course.grade_column_title, course.anonymous, course.attempt) == ("Grade", True, "best")
     assert course.due.isoformat() == "2026-11-20T23:59:59+01:00"
     assert (course.late_rule, course.include_pending) == (parse_late_rule("5%/hour"), False)
 

@@ -399,7 +399,7 @@ def test_barometer_samples_missing_in_log_are_reconstructed(every: int, has_filt
     record = made(
         FusionRecord,
         height_bias_updates={"baro_hgt": bias},
-        stores_bias_increments=False,
+        has_delta_angle_biases=False,
         status_flags={},
     )
     state = pd.DataFrame({"down_m_s": 0.0}, time_s)

@@ -256,7 +256,7 @@ def test_size_of_jump_at_reset_does_not_depend_on_time_offset() -> None:
         errors = fit_systematic_errors(
             comparison.flight, tuple(axes), RIGHT, sigma_a_m_s2=0.27, sigma_z_m=0.1,
             outlier_time_s=np.array([]), clock_offset_s=delay_s,
-            source_resets_s=[time_s[np.searchsorted(time_s, 40.0 - delay_s)]],
+            source_reset_times_s=[time_s[np.searchsorted(time_s, 40.0 - delay_s)]],
         )  # fmt: skip
         (jump,) = errors.jumps
         assert jump.time_s + delay_s == pytest.approx(40.1, abs=0.01)

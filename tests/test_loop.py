@@ -15,7 +15,7 @@ from px4fuse.diagnose import analyse_loop_closure, prepare_comparison
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.findings import find_loop_findings, source_convention
 from px4fuse.flight.model import Columns, Unavailable
-from px4fuse.lesson import ODOMETRY_CORNERS_M, format_loop_lines
+from px4fuse.lesson import ODOMETRY_CORNERS_M, format_loop_example_lines
 from px4fuse.loop import tracks
 from px4fuse.loop.analysis import analyse, analyse_flight_loop
 from px4fuse.loop.corrections import (
@@ -124,7 +124,7 @@ def test_loop_command_on_lesson_example_2_equals_lesson_output() -> None:
     found = close_loop(Trajectory("corners", "vio", np.arange(5.0), corners, None, "FRD"))
     error, total = closure_error_vector_m(found), found.path_length_m
     corrected = path(found, "by_distance_plain").trajectory.position_m
-    assert list(format_loop_lines()) == [
+    assert list(format_loop_example_lines()) == [
         f"loop closure error ({error[0]:.1f}, {error[1]:.1f}) m over {total:.1f} m = "
         f"{found.closure_error_m / total:.1%}",
         *(

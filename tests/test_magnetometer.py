@@ -207,11 +207,11 @@ def test_mean_field_is_restored_from_filtered_mag_innovations() -> None:
         remaining, [count, *range(20, 26)]
     )  # the logger missed one row, then three seconds
     fields = [*Columns.EARTH_MAGNETIC_FIELD, *Columns.BODY_MAGNETIC_FIELD]
-    delayed = pd.DataFrame(dict(zip(fields, [*EARTH, *body], strict=True)), [99.0, 200.0])
+    delayed_state = pd.DataFrame(dict(zip(fields, [*EARTH, *body], strict=True)), [99.0, 200.0])
     matrices = rotation.as_matrix()
     segment = made(ReplaySegment, time_s=time_s, body_to_ned=matrices, attitude_error_rad=error)
     found = _compute_mean_magnetic_field(
-        segment, delayed, measured_at_s[remaining], filtered[remaining]
+        segment, delayed_state, measured_at_s[remaining], filtered[remaining]
     )
     near = np.flatnonzero(np.diff(remaining) < 20) + 1
     assert found.sample_count.tolist() == np.diff(remaining)[near - 1].tolist()

@@ -23,7 +23,7 @@ from px4fuse.filter.fitting import (
     NoiseFit,
     NoiseParameters,
     _compute_outlier_probability,
-    compute_log_sigma_z_variance_factor,
+    compute_variance_factor_of_ln_sigma_z,
     convert_to_positions_and_increments,
     fit_constant_errors,
     maximise_likelihood,
@@ -93,7 +93,7 @@ def test_banded_solver_equals_dense_normal_equations(seed: int) -> None:
     state = system.solve(*signals).reshape(3, 2 * count)
     np.testing.assert_allclose(state.T, expected, rtol=1e-6, atol=1e-6)
     weighted = system.weight_increments(dp, dv)
-    explained = system.whiten(measured, *weighted)
+    explained = system.whiten_explained_part(measured, *weighted)
     products = precision[:, 0] * measured @ measured.T + dp @ weighted[0].T + dv @ weighted[1].T
     products -= explained @ explained.T
     np.testing.assert_allclose(products, left.T @ left, rtol=1e-6, atol=1e-6)
@@ -152,7 +152,7 @@ def with_constants(offsets: int = 3) -> PositionsAndIncrements:
         process_noise_independent_of_sigma_a=np.outer(
             [0.3, 0.0, 0.2], rng.choice([0.0, 0.01], COUNT - 1)
         ),
-        prior_precision=initial, constant_prior_sigmas=np.array([0.3, 1.0, 0.1]),
+        prior_precision=initial, prior_sigmas_of_constant_errors=np.array([0.3, 1.0, 0.1]),
         delta_position_m=rng.normal(0.0, 0.3, (3, offsets, 4, COUNT - 1)),
         delta_velocity_m_s=rng.normal(0.0, 0.3, (3, offsets, 4, COUNT - 1)),
     )  # fmt: skip
@@ -222,7 +222,7 @@ def joint_normal(
     """Return data and covariance (with constants) of all axes, and each axis separately."""
     made = [stretch_normal(part, noises, variance, stretch, axis, at) for axis in range(3)]
     signals = np.concatenate([each[1] for each in made])
-    covariance = signals[:, 1:] * part.constant_prior_sigmas**2 @ signals[:, 1:].T
+    covariance = signals[:, 1:] * part.prior_sigmas_of_constant_errors**2 @ signals[:, 1:].T
     return signals[:, 0], covariance + block_diag(*(each[2] for each in made)), made
 
 
@@ -270,8 +270,8 @@ def test_likelihood_ignores_segment_with_a_single_position(start_known: bool) ->
         one, none = (fit_positions(*arguments(each, noises, np.ones(COUNT))) for each in both)
         np.testing.assert_allclose(one.compute_scores(), none.compute_scores(), rtol=1e-12)
         np.testing.assert_allclose(
-            one.estimate_segment_constants(),
-            none.estimate_segment_constants(),
+            one.estimate_constant_errors_by_segment(),
+            none.estimate_constant_errors_by_segment(),
             rtol=1e-9,
             atol=1e-12,
         )
@@ -284,10 +284,10 @@ def test_fitted_imu_biases_equal_dense_least_squares() -> None:
     for noises in SOME_NOISES[:5]:
         variance, square = np.full(COUNT, noises.sigma_z_m**2), np.zeros(COUNT)
         arranged = arguments(part, noises, np.ones(COUNT))
-        constants = fit_positions(*arranged).estimate_segment_constants()[:, 0]
+        constants = fit_positions(*arranged).estimate_constant_errors_by_segment()[:, 0]
         for stretch in range(2):
             _, _, made = joint_normal(part, noises, variance, stretch)
-            information, right = np.diag(part.constant_prior_sigmas**-2.0), np.zeros(3)
+            information, right = np.diag(part.prior_sigmas_of_constant_errors**-2.0), np.zeros(3)
             for _, signals, covariance in made[:2]:
                 by = -signals[:, 1:]  # effect of a constant on the positions
                 information = information + by.T @ np.linalg.solve(covariance, by)
@@ -507,7 +507,7 @@ def test_sigma_of_noise_estimate_follows_likelihood_curvature(axes, share, width
     found = _compute_outlier_probability(
         over, np.full(4000, axes), float(expit(best[2])), float(wide)
     )
-    widening = compute_log_sigma_z_variance_factor(over, np.full(4000, axes), found, float(wide))
+    widening = compute_variance_factor_of_ln_sigma_z(over, np.full(4000, axes), found, float(wide))
     assert widening > 1.1
     assert widening == pytest.approx(curved * 2.0 * axes * 4000, rel=0.01)
 

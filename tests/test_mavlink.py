@@ -514,7 +514,7 @@ def test_mavlink_gnss_position_is_relative_to_autopilot_origin(read, origin, clo
     """The receiver's timestamps may be boot time or UNIX time."""
     flight = read(outdoors(origin=origin, clock=clock))
     (track,) = flight.positions
-    assert (track.name, track.origin.is_fused_as_gnss, track.origin.is_auto_candidate) == (
+    assert (track.name, track.origin.is_fused_as_gnss, track.origin.is_selectable_by_default) == (
         "GPS_RAW_INT",
         True,
         True,
@@ -547,7 +547,7 @@ def test_mavlink_barometer_height_is_computed_from_pressure(read):
 
 def test_mavlink_gnss_not_used_by_ekf2_is_not_default_source(read):
     flight = read(outdoors(has_global_position=False))
-    assert not flight.positions[0].origin.is_auto_candidate
+    assert not flight.positions[0].origin.is_selectable_by_default
     with pytest.raises(MissingDataError, match=r"position.source`? GPS_RAW_INT"):
         compare(flight)
 

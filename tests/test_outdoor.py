@@ -114,9 +114,9 @@ def test_simulated_magnetometer_and_height_noise_equal_settings(tmp_path: Path) 
     np.testing.assert_allclose(off[before].mean(axis=0), 0.0, atol=0.008)
     np.testing.assert_allclose(off[~before].mean(axis=0), [0.0, 0.3, 0.0], atol=0.008)
     np.testing.assert_allclose(off[before].std(axis=0), 0.02, rtol=0.2)
-    height = record.delayed["down_m"].to_numpy()
-    error = height - np.interp(record.delayed.index, truth.index, truth["down_m"])
-    reported = float(np.sqrt(record.delayed["down_m2"].iloc[20:].mean()))
+    height = record.delayed_state["down_m"].to_numpy()
+    error = height - np.interp(record.delayed_state.index, truth.index, truth["down_m"])
+    reported = float(np.sqrt(record.delayed_state["down_m2"].iloc[20:].mean()))
     assert error[20:].std() == pytest.approx(reported, rel=0.3)
 
 
@@ -193,11 +193,11 @@ def test_larger_ekf2_acc_noise_reduces_nees_under_vibration() -> None:
     assert after == pytest.approx(0.8 * before, rel=0.05)
     # at the fusion horizon σ covers the error with this noise
     (replayed,) = replay_with_settings(analysis.ekf2_model, [dict(tried.change)])
-    delayed = project_state(replayed.delayed_state, analysis.main.axis, analysis.segment)[
+    delayed_state = project_state(replayed.delayed_state, analysis.main.axis, analysis.segment)[
         "position_m"
     ]
     truth = analysis.main.truth["position_m"]
-    error_m = delayed - np.interp(delayed.index, truth.index, truth, np.nan, np.nan)
+    error_m = delayed_state - np.interp(delayed_state.index, truth.index, truth, np.nan, np.nan)
     variances = (
         replayed.updates.filter(like="position_variance_")
         .filter(regex="north|east")

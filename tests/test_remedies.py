@@ -252,7 +252,7 @@ def test_clock_offset_option_inside_interval_sets_ekf2_delay(sample: Analysis) -
     clock = offset(sample, -0.145).time_offset  # the interval is ± 0.01 s
     for applied_s, expected_ms in ((0.0, 145.0), (-0.15, 150.0), (-0.2, 145.0)):
         clock = replace(clock, applied_s=applied_s)
-        delay_ms = remedies.estimate_differing_delay_ms(sample, clock, 0.0)
+        delay_ms = remedies.estimate_delay_if_not_as_logged_ms(sample, clock, 0.0)
         assert delay_ms == pytest.approx(expected_ms)
 
 

@@ -195,7 +195,8 @@ def offset(**changes: Any) -> SourceTimeOffset:
         SourceTimeOffset(
             applied_s=0.0, offset_s=0.005, interval_s=(-0.02, 0.03), sigma_s=0.012,
             is_determinable=True,
-            curve_time_offsets_s=curve, curve_log_likelihood_drops=curve**2 * 1e3, parts=parts,
+            likelihood_curve_offsets_s=curve, curve_log_likelihood_drops=curve**2 * 1e3,
+            parts=parts,
             drift_ppm=100.0, drift_sigma_ppm=300.0, change_p_value=0.4, sigma_a_m_s2=0.1,
             sigma_z_m=0.1,
             count=200,

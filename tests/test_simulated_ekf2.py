@@ -112,7 +112,7 @@ def test_simulated_ekf2_of_clean_flights_is_consistent():
 def test_simulated_ekf2_is_consistent_at_its_fusion_horizon(clean):
     """Position and velocity at the fusion horizon, their variances, and the estimated biases."""
     record, truth = clean.ekf2.record, clean.truth.samples
-    later = record.delayed[record.delayed.index > 15.0]
+    later = record.delayed_state[record.delayed_state.index > 15.0]
     error = later["north_m_s"] - np.interp(later.index, truth.index, truth["north_m_s"])
     assert 0.5 < np.mean(error**2 / later["north_m2_s2"]) < 2.5
     bias, gyro_bias = sensors.draw_imu_biases(AISLE, parse_faults([]))

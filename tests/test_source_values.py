@@ -32,7 +32,7 @@ from px4fuse.findings import (
 from px4fuse.findings.model import finding, group_by_cause
 from px4fuse.flight.model import REPEATED_TIMESTAMPS_NOTE, ClockMap, Columns, Flight, Unavailable
 from px4fuse.readers import read_log
-from px4fuse.readers.common import classify_invalid_positions, estimate_rounding_step
+from px4fuse.readers.common import classify_invalid_positions, estimate_quantisation_step
 from px4fuse.readers.position_file import read_position_file
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
@@ -98,12 +98,12 @@ def test_constant_positions_at_rest_are_valid():
 @pytest.mark.parametrize(("origin", "step"), [(5_334_567.0, 0.5), (691_234.0, 0.0625)])
 def test_rounding_step_of_float32_positions_is_found(origin, step):
     values = origin + np.random.default_rng(1).normal(0.0, 5.0, 400)
-    assert estimate_rounding_step(values.astype(np.float32).astype(float)) == step
-    assert estimate_rounding_step(values) < 0.01
+    assert estimate_quantisation_step(values.astype(np.float32).astype(float)) == step
+    assert estimate_quantisation_step(values) < 0.01
 
 
 def test_rounding_step_is_zero_for_difference_below_float_range():
-    assert estimate_rounding_step(np.array([0.0, 5e-324, 1e10])) == 0.0
+    assert estimate_quantisation_step(np.array([0.0, 5e-324, 1e10])) == 0.0
 
 
 @pytest.mark.parametrize(("column", "name", "severity", "control"), [
@@ -198,7 +198,7 @@ def test_single_sample_without_position_gives_only_a_note():
 
 @pytest.mark.parametrize(("step_m", "words"), [(0.5, "64-bit"), (0.1, "more digits")])
 def test_rounded_positions_report_recommends_more_digits(step_m, words):
-    (one,) = detected(with_track(aisle_flight(), rounding_step_m=step_m))
+    (one,) = detected(with_track(aisle_flight(), quantisation_step_m=step_m))
     assert words in one.remedy
 
 
@@ -239,7 +239,7 @@ def with_clock(flight: Flight, name: str, note: str = "", distinct: int | None =
 VALUE_FAULTS = {
     "source_is_ekf2_estimate": copied,
     "source_two_senders": alternating,
-    "source_positions_rounded": lambda flight: with_track(flight, rounding_step_m=0.5),
+    "source_positions_rounded": lambda flight: with_track(flight, quantisation_step_m=0.5),
     "source_timestamp_unit": lambda flight: with_clock(flight, "milliseconds"),
     "source_timestamps_shared": lambda flight: with_clock(
         flight, "local", REPEATED_TIMESTAMPS_NOTE, 120

@@ -10,14 +10,18 @@ from hypothesis import strategies as st
 from pyulog import ULog
 from ulog_tools import GENERATIONS, make_log, position, seconds_of, take
 
-from px4fuse.readers.ulog_topics import longest_increasing_run, measurement_time_us, read_topics
+from px4fuse.readers.ulog_topics import (
+    find_longest_increasing_subsequence,
+    measurement_time_us,
+    read_topics,
+)
 
 few_timestamps = st.lists(st.integers(-2, 12), max_size=9)
 any_timestamps = st.lists(st.integers(-(2**63), 2**63 - 1), max_size=60)
 
 
 def kept_indices(stamps: list[int]) -> list[int]:
-    return longest_increasing_run(np.array(stamps, dtype=np.int64)).tolist()
+    return find_longest_increasing_subsequence(np.array(stamps, dtype=np.int64)).tolist()
 
 
 def longest_run_length(stamps: list[int]) -> int:

@@ -93,12 +93,12 @@ def test_what_if_without_set_option_keeps_correct_parameters(estimated: WhatIfAn
     """The UWB noise is 0.10 m, as EKF2 assumes, and its timestamps are right."""
     assert estimated.uses_estimates
     assert not estimated.changes
-    assert not estimated.whatif.whatif
+    assert not estimated.statistics.whatif
     texts = [str(block) for block in make_whatif_page(estimated).blocks]
     assert any("fit this log best" in text for text in texts)
     table, found = (
         {label.strip(): cells for label, *cells in make_statistic_rows(estimated)},
-        estimated.whatif,
+        estimated.statistics,
     )
     every = (found.logged, found.replayed)
     assert table["north: mean NIS"] == [f"{s.axes['north'].nis_mean:.3g}" for s in every]
@@ -107,7 +107,7 @@ def test_what_if_without_set_option_keeps_correct_parameters(estimated: WhatIfAn
 
 
 def test_whatif_sweep_also_applies_parameters_of_set_option(swept: WhatIfAnalysis) -> None:
-    first, *values = swept.whatif.whatif
+    first, *values = swept.statistics.whatif
     assert dict(first.changed) == {"EKF2_EVP_GATE": 3.0}
     assert [v.changed["EKF2_EVP_NOISE"] for v in values] == pytest.approx([0.05, 0.1, 0.2])
     assert all(value.changed["EKF2_EVP_GATE"] == 3.0 for value in values)
@@ -137,11 +137,11 @@ class TestFlownFlights:
     def test_what_if_with_estimated_noise_has_no_rejections(self, shared_logs: Path) -> None:
         found = self.of(shared_logs, "v1.16.1_aisle_overconfident")
         assert set(found.changes) == {"EKF2_EVP_NOISE"}
-        (cured,) = found.whatif.whatif
+        (cured,) = found.statistics.whatif
         assert all(0.9 <= axis.nis_mean <= 1.1 for axis in cured.axes.values())
         assert cured.rejected_fraction == 0.0
-        assert found.whatif.logged.rejected_fraction > 0.5
-        assert cured.position_rmse_to_truth_m < 0.4 * error(found.whatif.logged)
+        assert found.statistics.logged.rejected_fraction > 0.5
+        assert cured.position_rmse_to_truth_m < 0.4 * error(found.statistics.logged)
 
     @pytest.mark.parametrize("name", ["v1.16.1_aisle_clock_late", "v1.16.1_aisle_clock_nosync"])
     def test_what_if_with_estimated_delay_restores_position_rmse(
@@ -149,16 +149,16 @@ class TestFlownFlights:
     ) -> None:
         found = self.of(shared_logs, name)
         assert found.changes["EKF2_EV_DELAY"] == pytest.approx(250.0, abs=25.0)
-        clean = self.of(shared_logs, "v1.16.1_aisle_nominal").whatif.logged
-        (cured,) = found.whatif.whatif
-        assert error(cured) < 1.2 * error(clean) < 0.5 * error(found.whatif.logged)
-        assert not any("would reach EKF2 after" in note for note in found.whatif.notes)
+        clean = self.of(shared_logs, "v1.16.1_aisle_nominal").statistics.logged
+        (cured,) = found.statistics.whatif
+        assert error(cured) < 1.2 * error(clean) < 0.5 * error(found.statistics.logged)
+        assert not any("would reach EKF2 after" in note for note in found.statistics.notes)
 
     def test_what_if_recovers_true_delay_from_wrong_ekf2_delay(self, shared_logs: Path) -> None:
         found = self.of(shared_logs, "v1.13.3_aisle_evdelay175")
         assert found.changes["EKF2_EV_DELAY"] == 0.0
-        (cured,) = found.whatif.whatif
-        assert error(cured) < 0.7 * error(found.whatif.logged)
+        (cured,) = found.statistics.whatif
+        assert error(cured) < 0.7 * error(found.statistics.logged)
         with pytest.raises(
             SettingsError, match="the largest sensor delay parameter sets the delay of"
         ):

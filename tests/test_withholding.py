@@ -14,7 +14,7 @@ from form_guesses import right
 from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.classroom.grading.form_points import (
-    FLIGHT_QUESTIONS_POINTS_FRACTION,
+    POINTS_FRACTION_OF_FLIGHT_QUESTIONS,
     compute_form_points,
 )
 from px4fuse.classroom.grading.grade import load_or_verify
@@ -98,8 +98,8 @@ def test_grade_adds_diagnosis_to_report_on_student_assignment(
     assert verdict.status == "verified"
     assert results.findings
     assert [*tmp_path.glob("*.diagnosis.pdf")]
-    again, _, is_loaded = load_or_verify(tmp_path, pdf, logs, assigned_hashes)
-    assert is_loaded
+    again, _, is_loaded_from_cache = load_or_verify(tmp_path, pdf, logs, assigned_hashes)
+    assert is_loaded_from_cache
     assert to_json(again) == to_json(results)
 
 
@@ -124,7 +124,7 @@ def test_form_without_answers_on_plots_earns_part_of_points() -> None:
     assert compute_form_points(complete, answer.form).fraction == pytest.approx(1.0)
     copied = replace(complete, choices=())
     assert compute_form_points(copied, answer.form).fraction == pytest.approx(
-        FLIGHT_QUESTIONS_POINTS_FRACTION
+        POINTS_FRACTION_OF_FLIGHT_QUESTIONS
     )
     for letter in CHOICE_LETTERS:
         guessed = replace(complete, choices=(letter,) * len(answer.form.choices))

@@ -8,7 +8,7 @@ import pandas as pd
 
 from px4fuse.alignment.time_and_pose_fit import (
     INTERPOLATION_ERROR_M,
-    MIN_CONCORDANCE_TO_ACCEPT_MATCH,
+    MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH,
     CorrelationPeak,
     TrackFit,
     find_correlation_peak,
@@ -44,13 +44,13 @@ FRAMES_FOR_GIVEN_YAW = ("ned", "enu", "nwu")
 MAX_FILE_DURATION_S = 86400.0
 # Minimum concordance correlation coefficient (Lin 1989) of position file and reference track;
 # below it, px4fuse prints a warning
-MIN_CONCORDANCE_WITHOUT_WARNING = {EKF2_REFERENCE: 0.9, IMU_REFERENCE: 0.7}
+MIN_CONCORDANCE_CORRELATION_WITHOUT_WARNING = {EKF2_REFERENCE: 0.9, IMU_REFERENCE: 0.7}
 # Maximum standard deviation (s) of an accepted time offset
 MAX_TIME_OFFSET_SIGMA_S = 0.5
 # The best frame is unambiguous if the residual in the second best frame is larger by this factor
 MIN_SECOND_TO_BEST_FRAME_RESIDUAL_RATIO = 1.3
 # Minimum residual with the given yaw ÷ residual with the estimated yaw, to report a wrong yaw
-MIN_GIVEN_TO_ESTIMATED_YAW_RESIDUAL_RATIO = 2.0
+MIN_RESIDUAL_RATIO_OF_GIVEN_TO_ESTIMATED_YAW = 2.0
 # Minimum residual (m, RMS) with the given yaw, to report a wrong yaw
 MIN_RESIDUAL_OF_MISALIGNED_FRAME_M = 0.3
 
@@ -93,7 +93,7 @@ class Match:
         RMS position residual (m) in each tried frame, best first.
     fit : TrackFit
         Fit with the yaw from the user.
-    estimated_yaw_fit : TrackFit
+    fit_with_estimated_yaw : TrackFit
         Fit with estimated yaw.
     is_given_yaw_wrong : bool
         True if the yaw from the user is wrong.
@@ -103,13 +103,13 @@ class Match:
     frame: str
     rms_m_by_frame: dict[str, float]
     fit: TrackFit
-    estimated_yaw_fit: TrackFit
+    fit_with_estimated_yaw: TrackFit
     is_given_yaw_wrong: bool
 
     @property
     def time_offset_fit(self) -> TrackFit:
         """Fit with the estimated yaw if that of the user is wrong, which falsifies the offset."""
-        return self.estimated_yaw_fit if self.is_given_yaw_wrong else self.fit
+        return self.fit_with_estimated_yaw if self.is_given_yaw_wrong else self.fit
 
     @property
     def residuals_text(self) -> str:
@@ -176,31 +176,41 @@ def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) 
         fits.sort(key=lambda frame_and_fit: frame_and_fit[1].residual_rms_m)
         rms_m_by_frame = {frame: fit.residual_rms_m for frame, fit in fits}
         best_frame, fit = fits[0]
-        estimated_yaw_fit = fit
+        fit_with_estimated_yaw = fit
         if yaw_rad is not None:
-            estimated_yaw_fit = _fit_file_in_frame(problem, reference, best_frame, None)
-        is_given_yaw_wrong = is_reliable_fit(estimated_yaw_fit, reference_name) and (
-            fit.concordance < MIN_CONCORDANCE_TO_ACCEPT_MATCH[reference_name]
-            or needs_rotation(fit.horizontal_rms_m, estimated_yaw_fit, reference_name)
+            fit_with_estimated_yaw = _fit_file_in_frame(problem, reference, best_frame, None)
+        is_given_yaw_wrong = is_reliable_fit(fit_with_estimated_yaw, reference_name) and (
+            fit.concordance_correlation
+            < MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference_name]
+            or needs_rotation(fit.horizontal_rms_m, fit_with_estimated_yaw, reference_name)
         )
         matches.append(
-            Match(reference, best_frame, rms_m_by_frame, fit, estimated_yaw_fit, is_given_yaw_wrong)
+            Match(
+                reference,
+                best_frame,
+                rms_m_by_frame,
+                fit,
+                fit_with_estimated_yaw,
+                is_given_yaw_wrong,
+            )
         )
     return min(matches, key=lambda match: match.time_offset_fit.residual_rms_m)
 
 
-def needs_rotation(horizontal_rms_m: float, estimated_yaw_fit: TrackFit, reference: str) -> bool:
+def needs_rotation(
+    horizontal_rms_m: float, fit_with_estimated_yaw: TrackFit, reference: str
+) -> bool:
     """Return True if estimating the yaw reduces the horizontal residual (m) much."""
     return (
         horizontal_rms_m
-        > MIN_GIVEN_TO_ESTIMATED_YAW_RESIDUAL_RATIO * estimated_yaw_fit.horizontal_rms_m
+        > MIN_RESIDUAL_RATIO_OF_GIVEN_TO_ESTIMATED_YAW * fit_with_estimated_yaw.horizontal_rms_m
         and (horizontal_rms_m > MIN_RESIDUAL_OF_MISALIGNED_FRAME_M or reference == IMU_REFERENCE)
     )
 
 
 def is_reliable_fit(fit: TrackFit, reference: str) -> bool:
     return (
-        fit.concordance >= MIN_CONCORDANCE_WITHOUT_WARNING[reference]
+        fit.concordance_correlation >= MIN_CONCORDANCE_CORRELATION_WITHOUT_WARNING[reference]
         and fit.second_to_best_residual_ratio >= MIN_SECOND_BEST_RESIDUAL_RATIO
     )
 
@@ -208,11 +218,11 @@ def is_reliable_fit(fit: TrackFit, reference: str) -> bool:
 def _require_unique_match(match: Match) -> None:
     reference_name = match.reference.name
     fit = match.time_offset_fit
-    if fit.concordance < MIN_CONCORDANCE_TO_ACCEPT_MATCH[reference_name]:
+    if fit.concordance_correlation < MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference_name]:
         raise NoMatchError(
             f"the position file does not match the {reference_name}: Lin's concordance correlation "
-            f"coefficient is {fit.concordance:.2f} (minimum "
-            f"{MIN_CONCORDANCE_TO_ACCEPT_MATCH[reference_name]:g})"
+            f"coefficient is {fit.concordance_correlation:.2f} (minimum "
+            f"{MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference_name]:g})"
         )
     ambiguity_text = ""
     if fit.second_to_best_residual_ratio < MIN_SECOND_BEST_RESIDUAL_RATIO:
@@ -257,9 +267,11 @@ def _refit_without_origin_resets(flight: Flight, match: Match, problem: Alignmen
         ekf2_track,
         is_lag_estimated=problem.lag_s is None,
     )
-    estimated_yaw_fit = refit(match.estimated_yaw_fit, None)
-    fit = estimated_yaw_fit if problem.yaw_rad is None else refit(match.fit, problem.yaw_rad)
-    return replace(match, reference=ekf2_track, fit=fit, estimated_yaw_fit=estimated_yaw_fit)
+    fit_with_estimated_yaw = refit(match.fit_with_estimated_yaw, None)
+    fit = fit_with_estimated_yaw if problem.yaw_rad is None else refit(match.fit, problem.yaw_rad)
+    return replace(
+        match, reference=ekf2_track, fit=fit, fit_with_estimated_yaw=fit_with_estimated_yaw
+    )
 
 
 def _fit_file_in_frame(

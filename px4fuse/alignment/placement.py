@@ -13,7 +13,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.alignment.matching import (
-    MIN_CONCORDANCE_WITHOUT_WARNING,
+    MIN_CONCORDANCE_CORRELATION_WITHOUT_WARNING,
     AlignmentProblem,
     Match,
     find_match,
@@ -21,7 +21,7 @@ from px4fuse.alignment.matching import (
     needs_rotation,
 )
 from px4fuse.alignment.time_and_pose_fit import (
-    MIN_CONCORDANCE_TO_ACCEPT_MATCH,
+    MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH,
     compute_clipped_rms_m,
 )
 from px4fuse.alignment.tracks import (
@@ -193,7 +193,7 @@ def align_position_file(
         invalid_reasons=invalid_reasons.set_axis(
             invalid_reasons.index + (aligned_samples.index[0] - start_s)
         ),
-        rounding_step_m=recording.rounding_step_m,
+        quantisation_step_m=recording.quantisation_step_m,
     )
     notes = [
         f"{recording.name}: {text}"
@@ -286,7 +286,7 @@ def _apply_alignment(
         ekf2_comparison
         and not (is_yaw_estimated or frame_conflict)
         and reference_correlation is not None
-        and reference_correlation < MIN_CONCORDANCE_TO_ACCEPT_MATCH[EKF2_REFERENCE]
+        and reference_correlation < MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[EKF2_REFERENCE]
     ):
         warnings.append(
             "The position file does not match the EKF2 position (correlation "
@@ -346,7 +346,7 @@ def _compare_with_ekf2(
 
 def _describe_frame_conflict(match: Match, distance_to_ekf2_m: Array | None, yaw_rad: float) -> str:
     reference_name = match.reference.name
-    fit = match.estimated_yaw_fit
+    fit = match.fit_with_estimated_yaw
     is_rotated = match.is_given_yaw_wrong
     shift_text, shift_m = "", 0.0
     if distance_to_ekf2_m is not None:
@@ -371,10 +371,10 @@ def _describe_frame_conflict(match: Match, distance_to_ekf2_m: Array | None, yaw
 def _find_warnings(match: Match, is_yaw_estimated: bool) -> Iterator[str]:
     reference_name = match.reference.name
     fit = match.time_offset_fit
-    if fit.concordance < MIN_CONCORDANCE_WITHOUT_WARNING[reference_name]:
+    if fit.concordance_correlation < MIN_CONCORDANCE_CORRELATION_WITHOUT_WARNING[reference_name]:
         yield (
             f"The position file matches the {reference_name} poorly: Lin's concordance correlation "
-            f"coefficient is {fit.concordance:.2f}."
+            f"coefficient is {fit.concordance_correlation:.2f}."
         )
     if fit.second_to_best_residual_ratio < MIN_RESIDUAL_RATIO_WITHOUT_WARNING[reference_name]:
         yield (

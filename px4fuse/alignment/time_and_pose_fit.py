@@ -20,7 +20,7 @@ from px4fuse.trajectory.time_offset import GRID_STEP_S
 # Maximum change (s) of the lag from the correlation peak to the least-squares fit
 MAX_LAG_CORRECTION_S = 1.0
 # Minimum concordance correlation coefficient (Lin 1989) of an accepted match
-MIN_CONCORDANCE_TO_ACCEPT_MATCH = {EKF2_REFERENCE: 0.7, IMU_REFERENCE: 0.5}
+MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH = {EKF2_REFERENCE: 0.7, IMU_REFERENCE: 0.5}
 # Lower limit of 1 - c in the match quality -N·ln(1 - c) of N samples with concordance c. Without
 # this limit, a lag with a few samples at equal positions would be the best match
 MIN_CONCORDANCE_DEFICIT = 1e-4
@@ -40,7 +40,7 @@ class CorrelationPeak:
     ----------
     lag_s : float
         Time to add to the times of the file.
-    concordance : float
+    concordance_correlation : float
         Lin's concordance correlation coefficient, 1 for equal tracks.
     second_peak_lag_difference_s : float
         Second best lag minus best lag; NaN without a second peak.
@@ -49,7 +49,7 @@ class CorrelationPeak:
     """
 
     lag_s: float
-    concordance: float = np.nan
+    concordance_correlation: float = np.nan
     second_peak_lag_difference_s: float = np.nan
     second_to_best_residual_ratio: float = np.inf
 
@@ -114,10 +114,12 @@ def find_correlation_peak(
     rotated_covariance = (
         np.abs(covariance) if yaw_rad is None else (np.exp(-1j * yaw_rad) * covariance).real
     )
-    concordance = np.zeros_like(square_sum_m2)
-    concordance[has_overlap] = 2.0 * rotated_covariance[has_overlap] / square_sum_m2[has_overlap]
+    concordance_correlation = np.zeros_like(square_sum_m2)
+    concordance_correlation[has_overlap] = (
+        2.0 * rotated_covariance[has_overlap] / square_sum_m2[has_overlap]
+    )
     log_likelihood_gain = -common_sample_counts * np.log(
-        np.maximum(1.0 - concordance, MIN_CONCORDANCE_DEFICIT)
+        np.maximum(1.0 - concordance_correlation, MIN_CONCORDANCE_DEFICIT)
     )
     best_index = int(np.argmax(np.where(has_overlap, log_likelihood_gain, -np.inf)))
 
@@ -128,15 +130,15 @@ def find_correlation_peak(
         has_overlap
         & (common_sample_counts >= 0.5 * common_sample_counts[best_index])
         & (square_sum_m2 >= 0.25 * square_sum_m2[best_index])
-        & (concordance >= MIN_CONCORDANCE_TO_ACCEPT_MATCH[reference.name])
+        & (concordance_correlation >= MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference.name])
     )
     # The best peak ends where the concordance falls below half of its maximum
-    is_high = concordance >= 0.5 * concordance[best_index]
+    is_high = concordance_correlation >= 0.5 * concordance_correlation[best_index]
     for indices_from_best in (np.arange(best_index, -1, -1), np.arange(best_index, len(is_high))):
         near_indices = indices_from_best[: round(MIN_PEAK_DISTANCE_S / GRID_STEP_S) + 1]
         is_in_best_peak = np.logical_and.accumulate(is_high[near_indices])
         can_be_second_peak[near_indices[is_in_best_peak]] = False
-    peak = CorrelationPeak(compute_lag_s(best_index), concordance[best_index])
+    peak = CorrelationPeak(compute_lag_s(best_index), concordance_correlation[best_index])
     if not can_be_second_peak.any():
         return peak
     mean_square_residual_m2 = np.maximum(square_sum_m2 - 2.0 * rotated_covariance, 0.0) / (
@@ -241,18 +243,18 @@ def fit_by_least_squares(
     if len(down_difference_m):
         origin_down_m = float(np.median(down_difference_m))
         vertical_rms_m = compute_clipped_rms_m(down_difference_m - origin_down_m)
-    concordance = peak.concordance
-    if np.isnan(concordance):
+    concordance_correlation = peak.concordance_correlation
+    if np.isnan(concordance_correlation):
         rotated_covariance_m2 = (np.exp(-1j * fitted_yaw_rad) * covariance_m2).real
         mean_of_variances_m2 = max((file_variance_m2 + reference_variance_m2) / 2.0, 1e-300)
-        concordance = rotated_covariance_m2 / mean_of_variances_m2
+        concordance_correlation = rotated_covariance_m2 / mean_of_variances_m2
     complex_origin_m = (
         complex(origin_north_m, origin_east_m) - np.exp(1j * fitted_yaw_rad) * centre_m
     )
     return TrackFit(
         lag_s=peak.lag_s + lag_correction_s,
         lag_sigma_s=lag_sigma_s,
-        concordance=concordance,
+        concordance_correlation=concordance_correlation,
         second_peak_lag_difference_s=peak.second_peak_lag_difference_s,
         second_to_best_residual_ratio=peak.second_to_best_residual_ratio,
         yaw_rad=fitted_yaw_rad,

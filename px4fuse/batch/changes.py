@@ -150,15 +150,15 @@ def _read_given_results(path: Path) -> InputResults | None:
 
 
 def _analyse_log(
-    path: Path, input_with_settings: InputResults | None, progress: ProgressCallback
+    path: Path, input_to_copy_settings_from: InputResults | None, progress: ProgressCallback
 ) -> InputResults:
     request = ComparisonRequest(log=str(path))
-    if input_with_settings is not None:
-        is_same_log = input_with_settings.results.log.sha256 in hash_files([path])
+    if input_to_copy_settings_from is not None:
+        is_same_log = input_to_copy_settings_from.results.log.sha256 in hash_files([path])
         copied_setting_names = (
             {*request.__struct_fields__} - _INPUT_FILE_SETTINGS if is_same_log else _FILTER_SETTINGS
         )
-        given_request = input_with_settings.results.request
+        given_request = input_to_copy_settings_from.results.request
         request = replace(
             request, **{name: getattr(given_request, name) for name in copied_setting_names}
         )

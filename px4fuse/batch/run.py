@@ -83,8 +83,8 @@ class _RunState:
     settings: str
     # finished logs by SHA-256, also of earlier runs
     cached_rows_by_hash: dict[str, CachedRows] = field(default_factory=dict)
-    hash_by_address: dict[str, str] = field(default_factory=dict)
-    failed_row_by_address: dict[str, Row] = field(default_factory=dict)
+    hash_by_log_address: dict[str, str] = field(default_factory=dict)
+    failed_row_by_log_address: dict[str, Row] = field(default_factory=dict)
     # SHA-256 of logs that were finished in an earlier run
     reused_hashes: set[str] = field(default_factory=set)
 
@@ -131,11 +131,11 @@ def run_batch(
     OutputError
         A result cannot be written.
     """
-    sources = (paths,) if isinstance(paths, str | Path) else paths
+    log_paths_or_urls = (paths,) if isinstance(paths, str | Path) else paths
     with TemporaryDirectory(prefix="px4fuse-") as temporary_folder:
         folder = Path(temporary_folder if output is None else output)
         batch_result = run(
-            map(str, sources), folder, reports=reports and output is not None, **settings
+            map(str, log_paths_or_urls), folder, reports=reports and output is not None, **settings
         )
     # without an output folder, the files were temporary
     empty_columns = {} if output else dict.fromkeys(OUTPUT_FILE_COLUMNS, "")
@@ -203,13 +203,13 @@ def run(
         try:
             for number, (job, outcome) in enumerate(finished_jobs, 1):
                 _cache_outcome(state, log_by_address[job.address], outcome)
-                failure_count = len(state.failed_row_by_address)
+                failure_count = len(state.failed_row_by_log_address)
                 progress(f"comparing logs, {failure_count} failed", number, len(jobs))
         except Px4FuseError as error:
             resume_note = RESUME_NOTE if (output / "rows").is_dir() else ""
             raise type(error)(f"{error} {resume_note}".rstrip()) from error
         finally:
-            if state.hash_by_address or state.failed_row_by_address:
+            if state.hash_by_log_address or state.failed_row_by_log_address:
                 batch_result = _write_table(state, logs)
     return batch_result
 
@@ -240,13 +240,13 @@ def _cache_outcome(state: _RunState, log: LogAddress, outcome: LogOutcome | JobF
         error = LogError(outcome.reason.rstrip("."), remedy)
         outcome = LogOutcome("", (make_failure_row(error, STATUS_FAILED),))
     if outcome.rows and outcome.rows[0]["status"] == STATUS_FAILED:
-        state.failed_row_by_address[log.address] = outcome.rows[0]
+        state.failed_row_by_log_address[log.address] = outcome.rows[0]
         return
     if not outcome.rows:
         state.reused_hashes.add(outcome.sha256)
     elif outcome.sha256 not in state.cached_rows_by_hash:  # otherwise two logs are identical
         state.cached_rows_by_hash[outcome.sha256] = _write_log(state, log, outcome)
-    state.hash_by_address[log.address] = outcome.sha256
+    state.hash_by_log_address[log.address] = outcome.sha256
 
 
 def _write_log(state: _RunState, log: LogAddress, outcome: LogOutcome) -> CachedRows:
@@ -273,9 +273,9 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
     all_rows: list[Row] = []
     first_log_by_hash: dict[str, LogAddress] = {}
     for log in logs:
-        sha256 = state.hash_by_address.get(log.address, "")
+        sha256 = state.hash_by_log_address.get(log.address, "")
         first_log = first_log_by_hash.setdefault(sha256, log)
-        if failed_row := state.failed_row_by_address.get(log.address):
+        if failed_row := state.failed_row_by_log_address.get(log.address):
             rows = [failed_row]
         elif not sha256:  # batch stopped before this log
             continue

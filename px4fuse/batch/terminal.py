@@ -41,7 +41,7 @@ def format_summary(batch_result: BatchResult) -> Page:
             rows,
             right_aligned_columns=(3, 4, 5, 6),
         )
-        page.write_small_text(RATIO_NOTE)
+        page.write_muted_text(RATIO_NOTE)
     if len(sorted_logs) > MAX_LISTED_LOGS:
         page.write(f"fleet.html lists {len(sorted_logs) - MAX_LISTED_LOGS} more logs.")
     counts = logs["status"].value_counts()
@@ -99,7 +99,7 @@ def format_differences(results: ChangeResults) -> Page:
     if rows:
         page.add_table(NUMBER_TABLE_TITLES, rows, right_aligned_columns=(1, 2, 3, 4))
     tolerance_text = f"{100.0 * MAX_OMITTED_RELATIVE_DIFFERENCE:g} % or {MAX_OMITTED_DIFFERENCE:g}"
-    page.write_small_text(f"Numbers that differ by less than {tolerance_text} are not listed.")
+    page.write_muted_text(f"Numbers that differ by less than {tolerance_text} are not listed.")
     for finding in results.findings:
         styled_message = styled_text(
             f"{finding.severity}: {finding.message}", SEVERITY_COLOURS[finding.severity]

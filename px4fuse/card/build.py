@@ -475,7 +475,7 @@ def _explain_verdict_differences(
 def _explain_differing_verdicts(
     analysis: Analysis, sigma_verdicts: Sequence[Verdict], causes: Sequence[DiagnosedCause]
 ) -> str:
-    corrected_filters = {
+    filters_affected_by_fault = {
         "ekf2" if rerun.is_prediction else "kf"
         for cause in causes[:1]
         for rerun in cause.reruns
@@ -488,7 +488,7 @@ def _explain_differing_verdicts(
         and truth.ratio is not None
         and (
             source.word != truth.word
-            or (truth.ratio > 2.0 * source.ratio and source.filter not in corrected_filters)
+            or (truth.ratio > 2.0 * source.ratio and source.filter not in filters_affected_by_fault)
         )
     ]
     if not filters_with_differing_ratios:
@@ -497,7 +497,7 @@ def _explain_differing_verdicts(
     for fault_ids, sentence in SOURCE_FAULT_EXPLANATIONS:
         if not finding_ids.isdisjoint(fault_ids):
             return sentence
-    if corrected_filters.issuperset(filters_with_differing_ratios):
+    if filters_affected_by_fault.issuperset(filters_with_differing_ratios):
         filter_labels = " and ".join(FILTER_NAMES[name] for name in filters_with_differing_ratios)
         return (
             f"The first fault on this card hardly changes the innovations of {filter_labels}, but "
@@ -527,12 +527,12 @@ def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCau
         return ""
     difference_text = _format_difference(effect.difference_rms_m)
     reruns = ranked_causes[0].reruns
-    corrected_filters = {
+    filters_affected_by_fault = {
         rerun.filter
         for rerun in reruns
         if "position" in classify_improvement(rerun) or not can_show_effect(rerun)
     }
-    if len(corrected_filters) == 2:
+    if len(filters_affected_by_fault) == 2:
         return (
             f"{difference_text}. The first fault affects both KF and EKF2, so the difference KF − "
             "EKF2 hardly shows the fault."
@@ -540,7 +540,10 @@ def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCau
     rerun_difference_by_filter_m = {
         rerun.filter: rerun.after.difference_rms_m for rerun in reversed(reruns)
     }
-    is_only_ekf2_corrected = {"ekf2"} in (corrected_filters, rerun_difference_by_filter_m.keys())
+    is_only_ekf2_corrected = {"ekf2"} in (
+        filters_affected_by_fault,
+        rerun_difference_by_filter_m.keys(),
+    )
     rerun_difference_rms_m = rerun_difference_by_filter_m.get(
         "ekf2" if is_only_ekf2_corrected else "kf"
     )

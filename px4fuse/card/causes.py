@@ -90,13 +90,13 @@ def rank_causes(analysis: Analysis, cause_findings: Sequence[Finding]) -> list[R
         log_sigma_ratio_reduction = sum(map(compute_sigma_ratio_improvement, reruns))
         rank = _find_cause_rank(finding, reruns)
         ranked_causes.append(RankedCause(finding, rank, log_sigma_ratio_reduction, reruns))
-    fault_causes = [
+    causes_except_repeated_verdicts = [
         cause
         for cause in ranked_causes
         if FINDING_CATALOGUE[cause.finding.id].verdict != "repeated"
     ]
     return sorted(
-        fault_causes or ranked_causes,
+        causes_except_repeated_verdicts or ranked_causes,
         key=lambda cause: (
             cause.rank,
             # faults of the source first: a changed setting may only hide them
@@ -314,13 +314,13 @@ def _explain_missing_action(
 def _find_action_target(finding: Finding, source: PositionTrack | None = None) -> ActionTarget:
     group = FINDING_CATALOGUE[finding.id].group
     target = ACTION_TARGET_BY_FINDING_ID.get(finding.id) or ACTION_TARGET_BY_GROUP[group]
-    is_ekf2_parameter_set = finding.remedy.startswith(("Set EKF2_", "Check EKF2_"))
+    is_remedy_about_ekf2_parameter = finding.remedy.startswith(("Set EKF2_", "Check EKF2_"))
     is_ekf2_error_only = (
         finding.id == "error_exceeds_reported_sigma"
         and finding.evidence.get("filter") == "ekf2"
         and "kf_sigma_p_m" not in finding.evidence
     )
-    if (target == "sender" and is_ekf2_parameter_set) or is_ekf2_error_only:
+    if (target == "sender" and is_remedy_about_ekf2_parameter) or is_ekf2_error_only:
         target = "EKF2"
     is_gnss_receiver = target == "sender" and source is not None and source.origin.is_gnss
     return "receiver" if is_gnss_receiver else target

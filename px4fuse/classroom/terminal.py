@@ -71,7 +71,7 @@ def grading_page(outcome: GradeOutcome) -> Page:
     for grade in outcome.grades:
         if (report := grade.counted_report) and grade.total is None:
             name = one_line(grade.display_name, 60)
-            page.write_small_text(f"{name}: {report.pending_actions}")
+            page.write_muted_text(f"{name}: {report.pending_actions}")
     for note in outcome.notes:
-        page.write_small_text(note)
+        page.write_muted_text(note)
     return page

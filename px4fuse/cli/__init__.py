@@ -66,7 +66,7 @@ OPTION_NAMES_BY_COMMAND = {
     "evaluate": OPTION_NAMES[EvaluationRequest],
 }
 # Commands that need pyarrow; other commands do not import it, which saves 70 MB of memory
-COMMANDS_WITH_PARQUET = ("batch", "extract")
+COMMANDS_THAT_NEED_PYARROW = ("batch", "extract")
 
 
 class LazyCommandGroup(click.Group):
@@ -198,7 +198,7 @@ def _configure_libraries() -> None:
         os.environ.pop(name, None)
     # matplotlib warns if the home folder is read-only, which has no effect on px4fuse
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
-    if not set(COMMANDS_WITH_PARQUET) & set(sys.argv[1:2]):
+    if not set(COMMANDS_THAT_NEED_PYARROW) & set(sys.argv[1:2]):
         # with this entry, pandas does not import pyarrow, which needs 70 MB
         sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]
 

@@ -157,7 +157,7 @@ def grade(
         option_values.pop("title") or "",
         roster=None if roster is None else read_people(read_sheet(roster)),
         worksheets=tuple(map(read_sheet, option_values.pop("worksheet"))),
-        column=option_values.pop("column") or "",
+        grade_column_title=option_values.pop("column") or "",
         due=parse_due_time(due_time_text) if due_time_text else None,
         late_rule=parse_late_rule(late_rule_text) if late_rule_text else None,
         grace_s=60.0 * option_values.pop("grace"),

@@ -11,16 +11,16 @@ def lesson() -> None:
 @lesson.command()
 def kalman() -> None:
     """Print Example 1 of the course: KF with UWB positions in an aisle at 1 m/s."""
-    from px4fuse.lesson import format_kalman_lines
+    from px4fuse.lesson import format_kalman_example_lines
 
-    for line in format_kalman_lines():
+    for line in format_kalman_example_lines():
         click.echo(line)
 
 
 @lesson.command()
 def loop() -> None:
     """Print Example 2 of the course: loop closure error, distributed by distance."""
-    from px4fuse.lesson import format_loop_lines
+    from px4fuse.lesson import format_loop_example_lines
 
-    for line in format_loop_lines():
+    for line in format_loop_example_lines():
         click.echo(line)

@@ -32,7 +32,7 @@ MAX_NAME_BYTES, SHORTENED_NAME_BYTES = 200, 180
 # Empty name and id, for a report without a student
 NO_STUDENT_NAME = ("", "")
 # Line width (characters) in a pipe: longer than any paragraph
-PIPE_LINE_WIDTH = 10_000
+LINE_WIDTH_OF_PIPED_OUTPUT = 10_000
 # Key in the click context: paths of the files that the command has written
 WRITTEN_FILES_KEY = "px4fuse.written"
 # Key in the click context: True to open the output in its default program
@@ -373,7 +373,7 @@ def make_console(*, uses_stderr: bool = False) -> Console:
     console = PipeConsole(highlight=False, stderr=uses_stderr)
     columns_text = os.environ.get("COLUMNS", "")
     if not console.is_terminal and not (columns_text.isdecimal() and int(columns_text)):
-        console.width = PIPE_LINE_WIDTH
+        console.width = LINE_WIDTH_OF_PIPED_OUTPUT
     elif console.width < 1:  # COLUMNS=0: rich would print nothing
         console.width = shutil.get_terminal_size().columns
     return console

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from px4fuse.comparison.estimates import Estimates, TuningByAxis, find_first_tuning
+from px4fuse.comparison.estimates import Estimates, TuningByAxis, find_first_available_tuning
 from px4fuse.comparison.model import Comparison, FilterSummary
 from px4fuse.comparison.remedy import (
     make_delay_max_change,
@@ -15,12 +15,12 @@ from px4fuse.comparison.remedy import (
     make_estimated_noise_change,
 )
 from px4fuse.comparison.rerun_effects import (
+    CHANGE_KEYS_WITHOUT_EFFECT_ALONE,
     CONSISTENCY_STATISTICS,
     FORWARD_BIAS_KEY,
     OUTLIERS_KEY,
     RIGHT_BIAS_KEY,
     ROTATION_KEY,
-    SECONDARY_CHANGE_KEYS,
     TIME_OFFSET_KEY,
     Change,
     Statistic,
@@ -150,7 +150,7 @@ def classify_change(
     if ekf2_inputs is not None:
         aid = ekf2_inputs.aid
         kinds |= {aid.noise: "noise", aid.gate: "gate", aid.delay: "delay"}
-    changed_names = (name for name in change if name not in SECONDARY_CHANGE_KEYS)
+    changed_names = (name for name in change if name not in CHANGE_KEYS_WITHOUT_EFFECT_ALONE)
     return tuple(dict.fromkeys(kinds.get(name, "process noise") for name in changed_names))
 
 
@@ -167,7 +167,7 @@ def find_default_settings(comparison: Comparison) -> Change:
 
 def find_axis_tuning(tuning: TuningByAxis, axis: str) -> AxisTuning | None:
     """Return the noise estimate of an axis. North and east have a common estimate."""
-    return find_first_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
+    return find_first_available_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
 
 def _find_offset_changes(estimates: Estimates, ekf2_inputs: ReplayInputs | None) -> list[Change]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from msgspec import structs
 
-from px4fuse.comparison.estimates import TuningByAxis, find_first_tuning
+from px4fuse.comparison.estimates import TuningByAxis, find_first_available_tuning
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.remedy import find_used_noise_m
 from px4fuse.core.text import format_count
@@ -77,9 +77,13 @@ def explain_ekf2_difference(
             by_steps,
             corrected=dict(estimate_by_setting),
             steps=tuple(
-                step for step in by_steps.steps if step.position_moved_m > MIN_POSITION_CHANGE_M
+                replacement
+                for replacement in by_steps.steps
+                if replacement.position_moved_m > MIN_POSITION_CHANGE_M
             ),
-            outside=_compare_outside_replay(axis_results[name], kf_runs[name], by_steps.spans_s),
+            outside=_find_difference_at_times_without_replay(
+                axis_results[name], kf_runs[name], by_steps.spans_s
+            ),
         )
         explanation_by_axis[name] = add_cause_sentences(
             explanation, axis_results[name].axis.label, reasons
@@ -89,7 +93,7 @@ def explain_ekf2_difference(
 
 def find_corrected_noise_settings(comparison: Comparison, tuning: TuningByAxis) -> dict[str, float]:
     """Return the estimates of those KF noises that are wrong by a large factor."""
-    axis_tuning = find_first_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
+    axis_tuning = find_first_available_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
     if axis_tuning is None or comparison.source.origin.is_gnss:
         return {}
     estimate_by_setting = {}
@@ -126,7 +130,7 @@ def _make_comparable_settings(
     return settings if is_same_source else replace(settings, clock_offset_s=0.0)
 
 
-def _compare_outside_replay(
+def _find_difference_at_times_without_replay(
     axis_result: AxisComparison, kf_run: KfRun, spans_s: Spans
 ) -> DifferenceOutsideReplay | None:
     if isinstance(state := axis_result.ekf2.state, Unavailable):
@@ -141,7 +145,7 @@ def _compare_outside_replay(
 
 
 def add_cause_sentences(
-    explanation: DifferenceExplanation, axis_label: str, step_reasons: dict[str, str]
+    explanation: DifferenceExplanation, axis_label: str, reason_by_property_name: dict[str, str]
 ) -> DifferenceExplanation:
     """Add sentences on the causes of the difference KF - EKF2, largest first.
 
@@ -150,7 +154,7 @@ def add_cause_sentences(
     explanation : DifferenceExplanation
     axis_label : str
         Name of the axis, for example "the main axis".
-    step_reasons : mapping from str to str
+    reason_by_property_name : mapping from str to str
         Text for each possible cause, for example the measurement noise.
     """
     sentences = []
@@ -162,17 +166,20 @@ def add_cause_sentences(
             f"The following sentences explain a run of KF with the estimated noise "
             f"({settings_text})."
         )
-    first, second, *_ = sorted(explanation.steps, key=lambda step: -step.position_mean_square_m2)
+    first, second, *_ = sorted(
+        explanation.steps, key=lambda replacement: -replacement.position_mean_square_m2
+    )
     causes = [(f"Largest contribution to the difference KF - EKF2 along {axis_label}", first)]
     min_contribution_m2 = MIN_CONTRIBUTION_FRACTION * explanation.position_mean_square_m2
     if second.position_mean_square_m2 >= min_contribution_m2:
         causes.append(("Second largest contribution", second))
-    for rank_text, step in causes:
-        reason = step_reasons[step.name]
-        if step.name == steps.REJECTION_PROPERTY:
+    for rank_text, replacement in causes:
+        reason = reason_by_property_name[replacement.name]
+        if replacement.name == steps.REJECTION_PROPERTY:
             reason += _describe_rejections(explanation)
         sentences.append(
-            f"{rank_text}: {step.name}. {reason}. {_describe_step_effect(step, explanation)}"
+            f"{rank_text}: {replacement.name}. {reason}. "
+            f"{_describe_replacement_effect(replacement, explanation)}"
         )
     sentences += [_describe_unexplained_fractions(explanation), *_describe_rmse(explanation)]
     outside = explanation.outside
@@ -188,11 +195,13 @@ def add_cause_sentences(
     return structs.replace(explanation, sentences=tuple(sentences))
 
 
-def _describe_step_effect(step: PropertyReplacement, explanation: DifferenceExplanation) -> str:
-    explained_fraction = step.position_mean_square_m2 / explanation.position_mean_square_m2
+def _describe_replacement_effect(
+    replacement: PropertyReplacement, explanation: DifferenceExplanation
+) -> str:
+    explained_fraction = replacement.position_mean_square_m2 / explanation.position_mean_square_m2
     change_text = (
-        f"If KF uses EKF2's {step.name}, KF's position changes by up to "
-        f"{step.position_moved_m:.2f} m (at {step.moved_at_s:.1f} s)"
+        f"If KF uses EKF2's {replacement.name}, KF's position changes by up to "
+        f"{replacement.position_moved_m:.2f} m (at {replacement.moved_at_s:.1f} s)"
     )
     if explained_fraction > 1.0:
         return (
@@ -236,12 +245,12 @@ def _describe_property_differences(
         f"assumes {position_age_ms:.0f} ms"
     )
     if isinstance(time_offset, SourceTimeOffset) and time_offset.is_determinable:
-        age_ms, low_ms, high_ms = (
+        estimated_age_ms, low_ms, high_ms = (
             1e3 * (source.assumed_delay_s - offset_s)
             for offset_s in (time_offset.offset_s, *time_offset.interval_s[::-1])
         )
         delay_text += (
-            f". The maximum-likelihood estimate is {age_ms:.0f} ms (95 % {low_ms:.0f} to "
+            f". The maximum-likelihood estimate is {estimated_age_ms:.0f} ms (95 % {low_ms:.0f} to "
             f"{high_ms:.0f} ms)"
         )
     acc_noise = parameters["EKF2_ACC_NOISE"]
@@ -311,7 +320,10 @@ def _describe_rmse(explanation: DifferenceExplanation) -> list[str]:
             f"{100 * MAX_RELATIVE_RMSE_DIFFERENCE:.0f} %): KF {kf_rmse_m:.3f} m, EKF2 "
             f"{ekf2_rmse_m:.3f} m."
         ]
-    rmses_m = [kf_rmse_m, *(step.position_rmse_to_truth_m or 0.0 for step in explanation.steps)]
+    rmses_m = [
+        kf_rmse_m,
+        *(replacement.position_rmse_to_truth_m or 0.0 for replacement in explanation.steps),
+    ]
     mean_square_changes = np.diff(np.square(rmses_m))
     if ekf2_rmse_m < kf_rmse_m:
         mean_square_changes *= -1.0

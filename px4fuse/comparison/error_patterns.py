@@ -28,10 +28,10 @@ MIN_POSITIONS = 100
 # Rows of the four neighbours of a position, relative to the row of the position
 NEIGHBOUR_ROW_OFFSETS = np.array([-2, -1, 1, 2])
 # Maximum time span of the four neighbours of a position ÷ median interval, to exclude gaps
-MAX_NEIGHBOUR_SPAN_IN_INTERVALS = 8.0
+MAX_NEIGHBOUR_TIME_SPAN_IN_MEDIAN_INTERVALS = 8.0
 # Maximum σ of a residual (position - interpolation) ÷ σ of a position: above this ratio, the
 # interpolation is inaccurate
-MAX_RESIDUAL_SIGMA_RATIO = 4.0
+MAX_RESIDUAL_TO_POSITION_SIGMA_RATIO = 4.0
 # Number of timestamps in the running median that gives the timestamps without jitter
 TIMESTAMP_MEDIAN_FILTER_LENGTH = 9
 VELOCITY_HALF_WINDOW_S = 0.3
@@ -41,7 +41,7 @@ RESIDUAL_CORRELATION_LENGTH = 3
 MIN_JITTER_S = 0.008
 # Limits of the ratio of measured position residuals to residuals expected from jitter, which are
 # timestamp residual · velocity
-JITTER_RATIO_LIMITS = 0.6, 1.5
+RESIDUAL_TO_JITTER_ERROR_RATIO_LIMITS = 0.6, 1.5
 # Minimum RMS of the position residuals due to jitter ÷ RMS of all position residuals
 MIN_JITTER_PART_OF_RESIDUAL = 0.4
 # Jitter, and noise that increases with speed, are reported only above this multiple of their σ
@@ -81,7 +81,7 @@ FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT = 0.2
 MIN_BINS_PER_PERIOD = 30
 # Maximum fraction of the mean square of the vehicle's motion at the frequency of the sinusoidal
 # error: with more motion at this frequency, the motion may cause the error
-MAX_MOTION_FRACTION_AT_ERROR_FREQUENCY = 0.1
+MAX_FRACTION_OF_MOTION_AT_ERROR_FREQUENCY = 0.1
 # Sampling interval (s) of the compared rotations
 ROTATION_INTERVAL_S = 0.01
 # Maximum tested delay (s) of the logged attitude
@@ -156,9 +156,9 @@ class ErrorFit(NamedTuple):
     residual_m: Array
     white_noise_sigma_m: float
     scale: float
-    scale_sigma: float
+    scale_error_sigma: float
 
-    def compute_slow_mean_square_m2(self) -> float:
+    def compute_slow_error_mean_square_m2(self) -> float:
         """Return the mean square (m²) of the residuals without white noise."""
         return float(np.mean(self.residual_m**2, axis=0).sum()) - 2.0 * self.white_noise_sigma_m**2
 
@@ -207,7 +207,9 @@ def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
     neighbour_rows = rows[:, None] + NEIGHBOUR_ROW_OFFSETS
     elapsed_s = time_s[neighbour_rows] - time_s[rows, None]
     interval_s = compute_median_interval_s(time_s)
-    has_close_neighbours = np.ptp(elapsed_s, axis=1) < MAX_NEIGHBOUR_SPAN_IN_INTERVALS * interval_s
+    has_close_neighbours = (
+        np.ptp(elapsed_s, axis=1) < MAX_NEIGHBOUR_TIME_SPAN_IN_MEDIAN_INTERVALS * interval_s
+    )
     rows, neighbour_rows, elapsed_s = (
         array[has_close_neighbours] for array in (rows, neighbour_rows, elapsed_s)
     )
@@ -230,7 +232,9 @@ def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
     window_last_rows = np.clip(rows + half_window_rows, None, len(time_s) - 1)
     displacement_m = position_m[window_last_rows] - position_m[window_first_rows]
     velocity_m_s = displacement_m / (time_s[window_last_rows] - time_s[window_first_rows])[:, None]
-    has_small_interpolation_noise = residual_to_position_sigma_ratio < MAX_RESIDUAL_SIGMA_RATIO
+    has_small_interpolation_noise = (
+        residual_to_position_sigma_ratio < MAX_RESIDUAL_TO_POSITION_SIGMA_RATIO
+    )
 
     def compute_residual(values: Array) -> Array:
         interpolated_values = np.einsum("nk,nk...->n...", weights, values[neighbour_rows])
@@ -270,7 +274,9 @@ def find_timestamp_jitter(errors: LocalResiduals) -> float | None:
     )
     jitter_fraction = np.sqrt(expected_square_sum_m2 / np.sum(errors.residual_m**2))
     is_jitter = (
-        JITTER_RATIO_LIMITS[0] < residual_ratio < JITTER_RATIO_LIMITS[1]
+        RESIDUAL_TO_JITTER_ERROR_RATIO_LIMITS[0]
+        < residual_ratio
+        < RESIDUAL_TO_JITTER_ERROR_RATIO_LIMITS[1]
         and residual_ratio > MIN_SIGNIFICANCE_SIGMAS * residual_ratio_sigma
         and jitter_fraction > MIN_JITTER_PART_OF_RESIDUAL
     )
@@ -313,12 +319,14 @@ def find_speed_dependent_noise(errors: LocalResiduals) -> SpeedDependentNoise | 
         for noise_m in (along_track_residual_m, cross_track_residual_m)
     ):
         return None
-    slow_and_fast_noise_m = (
+    noise_at_low_and_high_speed_m = (
         SIGMA_PER_MEDIAN_ABSOLUTE_VALUE * float(np.median(np.abs(errors.residual_m[rows])))
         for rows in (is_slow, is_fast)
     )
-    slow_and_fast_speed_m_s = (float(np.median(speed_m_s[rows])) for rows in (is_slow, is_fast))
-    speed_dependent_noise = SpeedDependentNoise(*slow_and_fast_noise_m, *slow_and_fast_speed_m_s)
+    low_and_high_speed_m_s = (float(np.median(speed_m_s[rows])) for rows in (is_slow, is_fast))
+    speed_dependent_noise = SpeedDependentNoise(
+        *noise_at_low_and_high_speed_m, *low_and_high_speed_m_s
+    )
     is_relevant = (
         speed_dependent_noise.fast_m_s >= MIN_HIGH_SPEED_M_S
         and speed_dependent_noise.fast_m >= MIN_NOISE_AT_HIGH_SPEED_M
@@ -359,7 +367,9 @@ def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> Error
     independent_error_count = len(time_s) / max(
         *map(compute_autocorrelation_time, residual_m.T), 1.0
     )
-    scale_sigma = np.sqrt(np.mean(residual_m**2) / (path_mean_square_m2 * independent_error_count))
+    scale_error_sigma = np.sqrt(
+        np.mean(residual_m**2) / (path_mean_square_m2 * independent_error_count)
+    )
     if comparison.source.origin.may_drift:
         from scipy.ndimage import uniform_filter1d  # noqa: PLC0415 - slow import
 
@@ -382,7 +392,7 @@ def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> Error
         residual_m,
         white_noise_sigma_m,
         float(parameters[2]),
-        float(scale_sigma),
+        float(scale_error_sigma),
     )
 
 
@@ -402,7 +412,7 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
         round(MIN_PERIOD_COUNT / FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT),
         int(np.ceil(max_frequency_hz / frequency_step_hz)),
     )
-    if rows.stop <= rows.start or fit.compute_slow_mean_square_m2() <= 0.0:
+    if rows.stop <= rows.start or fit.compute_slow_error_mean_square_m2() <= 0.0:
         return None
     # Sum the errors in time bins of equal length, so that one FFT tests all frequencies
     bin_count = 2 ** int(
@@ -420,15 +430,15 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
         return 2.0 * float(np.sum(np.abs(complex_sinusoid @ values / len(values)) ** 2))
 
     periodic_mean_square_m2 = compute_mean_square_m2(fit.residual_m, frequency_hz)
-    motion_fraction_at_frequency = compute_mean_square_m2(fit.path_m, frequency_hz) / np.mean(
-        np.sum(fit.path_m**2, axis=1)
-    )
+    fraction_of_motion_at_error_frequency = compute_mean_square_m2(
+        fit.path_m, frequency_hz
+    ) / np.mean(np.sum(fit.path_m**2, axis=1))
     amplitude_m = float(np.sqrt(2.0 * periodic_mean_square_m2))
-    explained_fraction = periodic_mean_square_m2 / fit.compute_slow_mean_square_m2()
+    explained_fraction = periodic_mean_square_m2 / fit.compute_slow_error_mean_square_m2()
     if (
         explained_fraction < MIN_PERIODIC_ERROR_FRACTION
         or amplitude_m < MIN_AMPLITUDE_TO_WHITE_NOISE_RATIO * fit.white_noise_sigma_m
-        or motion_fraction_at_frequency > MAX_MOTION_FRACTION_AT_ERROR_FREQUENCY
+        or fraction_of_motion_at_error_frequency > MAX_FRACTION_OF_MOTION_AT_ERROR_FREQUENCY
     ):
         return None
     return PeriodicError(1.0 / frequency_hz, amplitude_m, explained_fraction)
@@ -467,14 +477,16 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     )
     parameters, residual_m = _fit_least_squares(columns[..., :-1], columns[..., -1])
     offsets_s = (time_offsets_by_column_s @ np.append(-parameters, 1.0))[moving_part_indices]
-    slow_mean_square_m2 = fit.compute_slow_mean_square_m2()
+    slow_error_mean_square_m2 = fit.compute_slow_error_mean_square_m2()
     unexplained_mean_square_m2 = (
         float(np.mean(residual_m**2, axis=0).sum()) - 2.0 * fit.white_noise_sigma_m**2
     )
     if (
         np.ptp(offsets_s) < MIN_OFFSET_RANGE_S
-        or slow_mean_square_m2 < MIN_SLOW_TO_WHITE_NOISE_RATIO * 2.0 * fit.white_noise_sigma_m**2
-        or unexplained_mean_square_m2 > MAX_REMAINING_SLOW_ERROR_FRACTION * slow_mean_square_m2
+        or slow_error_mean_square_m2
+        < MIN_SLOW_TO_WHITE_NOISE_RATIO * 2.0 * fit.white_noise_sigma_m**2
+        or unexplained_mean_square_m2
+        > MAX_REMAINING_SLOW_ERROR_FRACTION * slow_error_mean_square_m2
     ):
         return None
     times_s = fit.time_s[0] + OFFSET_PART_DURATION_S * (moving_part_indices + 0.5)
@@ -505,15 +517,15 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
     angle_rad = integrate_cumulatively(imu[Columns.ANGULAR_RATE].to_numpy(), imu_time_s)
 
     # The tested delays are multiples of the sampling interval
-    max_delay_rows = round(MAX_ATTITUDE_DELAY_S / ROTATION_INTERVAL_S)
+    max_delay_in_rows = round(MAX_ATTITUDE_DELAY_S / ROTATION_INTERVAL_S)
     gyro_time_s = time_s[0] + ROTATION_INTERVAL_S * np.arange(
-        -max_delay_rows, len(time_s) + max_delay_rows
+        -max_delay_in_rows, len(time_s) + max_delay_in_rows
     )
     angle_rad = interpolate_columns(gyro_time_s, imu_time_s, angle_rad)
     gyro_rotation_rad = angle_rad[samples_per_rotation:] - angle_rad[:-samples_per_rotation]
 
-    def compute_mean_square_rad2(delay_rows: int) -> float:
-        first_row = max_delay_rows - delay_rows
+    def compute_mean_square_rad2(delay_in_rows: int) -> float:
+        first_row = max_delay_in_rows - delay_in_rows
         rotation_differences_rad = (
             rotation_rad - gyro_rotation_rad[first_row : first_row + len(rotation_rad)]
         )
@@ -525,12 +537,12 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
         )
         return float(np.mean(limited_angles_rad**2))
 
-    tested_rows = range(-max_delay_rows, max_delay_rows + 1, 2)
-    coarse_index = 3 * int(np.argmin([*map(compute_mean_square_rad2, tested_rows[::3])]))
-    nearby_rows = tested_rows[max(coarse_index - 2, 0) : coarse_index + 3]
-    delay_rows = min(nearby_rows, key=compute_mean_square_rad2)
-    delay_s = ROTATION_INTERVAL_S * delay_rows
+    tested_delays_in_rows = range(-max_delay_in_rows, max_delay_in_rows + 1, 2)
+    coarse_index = 3 * int(np.argmin([*map(compute_mean_square_rad2, tested_delays_in_rows[::3])]))
+    nearby_delays_in_rows = tested_delays_in_rows[max(coarse_index - 2, 0) : coarse_index + 3]
+    delay_in_rows = min(nearby_delays_in_rows, key=compute_mean_square_rad2)
+    delay_s = ROTATION_INTERVAL_S * delay_in_rows
     is_delay_significant = abs(delay_s) >= MIN_ATTITUDE_DELAY_S and compute_mean_square_rad2(
-        delay_rows
+        delay_in_rows
     ) < MAX_REMAINING_ROTATION_DIFFERENCE_RATIO * compute_mean_square_rad2(0)
     return delay_s if is_delay_significant else None

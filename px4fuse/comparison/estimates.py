@@ -47,7 +47,7 @@ MIN_TIME_OFFSET_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
 # PX4 publishes vehicle_imu at 200 Hz (IMU_INTEG_RATE): slower telemetry skips samples
 MIN_TELEMETRY_IMU_HZ = 200.0
 # Measured IMU rates are up to 2 % lower than the nominal rate
-MIN_IMU_RATE_RATIO = 0.98
+MIN_MEASURED_TO_NOMINAL_IMU_RATE_RATIO = 0.98
 IMU_OSCILLATES = Unavailable(
     "low-pass filter of the position source",
     "the accelerometer oscillates, which resembles filtered positions",
@@ -79,7 +79,7 @@ class Estimates:
         Yaw misalignment of the position frame.
     axis_tunings : tuple of AxisTuning
         Noises along two perpendicular axes, if they differ.
-    noisy_part : NoisyPart or None
+    noisy_flight_part : NoisyPart or None
         Time span with larger innovations than in the rest of the flight.
     imu_oscillation : ImuOscillation or None
         Oscillation of the accelerometer that the positions do not contain.
@@ -92,7 +92,7 @@ class Estimates:
     source_low_pass: SourceLowPass | Unavailable
     time_correlated_noise: TimeCorrelatedNoise | Unavailable
     axis_tunings: tuple[AxisTuning, ...] = ()
-    noisy_part: NoisyPart | None = None
+    noisy_flight_part: NoisyPart | None = None
     imu_oscillation: ImuOscillation | None = None
 
 
@@ -100,7 +100,7 @@ def ignore_progress(_: str) -> None:
     """Ignore the progress text."""
 
 
-def find_first_tuning(tuning: TuningByAxis, *axis_names: str) -> AxisTuning | None:
+def find_first_available_tuning(tuning: TuningByAxis, *axis_names: str) -> AxisTuning | None:
     """Return the noise estimate of the first axis in ``axis_names`` that has an estimate."""
     axis_tunings = map(tuning.get, axis_names)
     return next(
@@ -121,11 +121,11 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
     )
     progress("heading")
     heading_error = estimate_frame_rotation(comparison, tuning, time_offset)
-    axis_tunings, noisy_part = tuple[AxisTuning, ...](), None
+    axis_tunings, noisy_flight_part = tuple[AxisTuning, ...](), None
     if comparison.source.orientation is None:  # no odometry
         if not comparison.source.origin.is_gnss:
             axis_tunings = tune_perpendicular_axes(comparison)
-        noisy_part = find_noisy_flight_part(comparison, tuning.get(HORIZONTAL))
+        noisy_flight_part = find_noisy_flight_part(comparison, tuning.get(HORIZONTAL))
     return Estimates(
         tuning=tuning,
         time_offset=time_offset,
@@ -134,7 +134,7 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
         source_low_pass=source_low_pass,
         time_correlated_noise=correlated_noise,
         axis_tunings=axis_tunings,
-        noisy_part=noisy_part,
+        noisy_flight_part=noisy_flight_part,
         imu_oscillation=imu_oscillation,
     )
 
@@ -189,7 +189,7 @@ def estimate_noises_and_time_offset(
         return tuning, low_imu_rate_reason
     settings, outlier_time_s = comparison.settings, None
     noises = NoiseParameters(settings.sigma_a_m_s2, settings.sigma_z_m)
-    if axis_tuning := find_first_tuning(tuning, HORIZONTAL, *tuning):
+    if axis_tuning := find_first_available_tuning(tuning, HORIZONTAL, *tuning):
         noises, outlier_time_s = axis_tuning.noises, axis_tuning.outlier_time_s
     time_offset = estimate_time_offset(
         comparison.flight,
@@ -217,7 +217,7 @@ def estimate_frame_rotation(
 ) -> HeadingError | Unavailable:
     """Estimate the yaw misalignment of the position frame."""
     sigma_z_m = comparison.settings.sigma_z_m
-    if axis_tuning := find_first_tuning(tuning, HORIZONTAL):
+    if axis_tuning := find_first_available_tuning(tuning, HORIZONTAL):
         sigma_z_m = axis_tuning.sigma_z.value_or_bound(sigma_z_m)
     offset_s = 0.0
     if isinstance(time_offset, SourceTimeOffset) and time_offset.is_determinable:
@@ -263,7 +263,7 @@ def _fit_source_errors(
         sigma_z_m=axis_tuning.sigma_z.value_or_bound(settings.sigma_z_m),
         outlier_time_s=axis_tuning.outlier_time_s,
         clock_offset_s=offset_s,
-        source_resets_s=comparison.source.reset_times_s.tolist(),
+        source_reset_times_s=comparison.source.reset_times_s.tolist(),
     )
     jumps = systematic_errors.jumps if isinstance(systematic_errors, SystematicErrors) else ()
     # The exact time of a jump is unknown: exclude the measurements directly after it
@@ -332,7 +332,7 @@ def explain_low_imu_rate(flight: Flight) -> Unavailable | None:
     is_telemetry = stream is not None and stream.topics[0] in TELEMETRY_IMU_MESSAGES
     required_hz = MIN_TELEMETRY_IMU_HZ if is_telemetry else MIN_TIME_OFFSET_IMU_HZ
     rate_hz = 1.0 / compute_median_interval_s(flight.imu.index)
-    if rate_hz >= MIN_IMU_RATE_RATIO * required_hz:
+    if rate_hz >= MIN_MEASURED_TO_NOMINAL_IMU_RATE_RATIO * required_hz:
         return None
     rate_note = f"the IMU was logged at {rate_hz:.3g} Hz"
     remedy = "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate."

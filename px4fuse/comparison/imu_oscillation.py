@@ -15,9 +15,9 @@ MIN_FREQUENCY_HZ, MAX_FREQUENCY_HZ, MAX_FREQUENCY_TO_RATE_RATIO = 0.1, 5.0, 0.45
 # The power of a peak at frequency f is compared with the median power from f ÷ ratio to f · ratio
 BAND_LIMIT_RATIO = 1.33
 # Minimum power of a peak ÷ median power: in flights without an oscillation, the ratio is below 6
-MIN_PEAK_TO_MEDIAN_POWER = 8.0
+MIN_PEAK_TO_MEDIAN_POWER_RATIO = 8.0
 # Maximum power of a peak in the positions ÷ power in the accelerations: a real motion is in both
-MAX_SOURCE_TO_IMU_POWER = 0.25
+MAX_SOURCE_TO_IMU_POWER_RATIO = 0.25
 MIN_AMPLITUDE_M_S2 = 0.3
 
 
@@ -56,16 +56,18 @@ def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | Non
         ]
     )
     headings_rad = np.unwrap(heading_rad(attitude))
-    turn = np.exp(-1j * np.interp(time_s[1:-1], attitude.index.to_numpy(), headings_rad))
-    window = np.hanning(len(turn))
-    second_differences_m = np.diff(positions_m, 2, axis=1) * turn * window
+    rotation_to_vehicle_axes = np.exp(
+        -1j * np.interp(time_s[1:-1], attitude.index.to_numpy(), headings_rad)
+    )
+    window = np.hanning(len(rotation_to_vehicle_axes))
+    second_differences_m = np.diff(positions_m, 2, axis=1) * rotation_to_vehicle_axes * window
     spectra = np.fft.fft([*second_differences_m, np.diff(second_differences_m, axis=0)[0]])
-    count = len(turn) // 2
+    count = len(rotation_to_vehicle_axes) // 2
     # The signals are complex: an oscillation along one axis has equal powers at positive and at
     # negative frequency. Add both
     powers = np.abs(spectra[:, 1:count]) ** 2 + np.abs(spectra[:, :-count:-1]) ** 2
     source_power, imu_power, error_power = (np.convolve(row, np.ones(3), "same") for row in powers)
-    frequencies_hz = np.arange(1, count) / (len(turn) * interval_s)
+    frequencies_hz = np.arange(1, count) / (len(rotation_to_vehicle_axes) * interval_s)
     first, end = np.searchsorted(
         frequencies_hz,
         [MIN_FREQUENCY_HZ, min(MAX_FREQUENCY_HZ, MAX_FREQUENCY_TO_RATE_RATIO / interval_s)],
@@ -90,8 +92,8 @@ def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | Non
     acceleration_per_difference = np.pi * frequency_hz / np.sin(np.pi * frequency_hz * interval_s)
     oscillation = ImuOscillation(frequency_hz, float(amplitude_m * acceleration_per_difference**2))
     is_oscillating = (
-        error_power[peak] > MIN_PEAK_TO_MEDIAN_POWER * medians[peak_index]
-        and source_power[peak] < MAX_SOURCE_TO_IMU_POWER * imu_power[peak]
+        error_power[peak] > MIN_PEAK_TO_MEDIAN_POWER_RATIO * medians[peak_index]
+        and source_power[peak] < MAX_SOURCE_TO_IMU_POWER_RATIO * imu_power[peak]
         and oscillation.amplitude_m_s2 > MIN_AMPLITUDE_M_S2
     )
     return oscillation if is_oscillating else None

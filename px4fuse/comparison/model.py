@@ -10,10 +10,10 @@ from msgspec import structs
 from px4fuse.convention.correction import ConventionFaults, find_convention_faults
 from px4fuse.convention.model import Convention
 from px4fuse.core.record import (
-    NOT_WRITTEN,
+    NOT_IN_JSON,
     Count,
+    NotInJson,
     NotNegative,
-    NotWritten,
     OrUnavailable,
     PositiveFloat,
     Record,
@@ -170,11 +170,11 @@ class AxisComparison(Record, kw_only=True):
     filters: Mapping[FilterName, RecordOrUnavailable[FilterSummary, UntestedFilter]]
     difference: OrUnavailable[Difference]
     rejected_fraction: Share | None = None
-    axis: NotWritten[Axis] = NOT_WRITTEN
-    kf_run: NotWritten[KfRun] = NOT_WRITTEN
-    tracks: NotWritten[Mapping[FilterName, FilterTracks]] = NOT_WRITTEN
-    truth: NotWritten[TableOrUnavailable] = NOT_WRITTEN
-    whole_flight_tracks: NotWritten[tuple[FilterTracks, TableOrUnavailable]] = NOT_WRITTEN
+    axis: NotInJson[Axis] = NOT_IN_JSON
+    kf_run: NotInJson[KfRun] = NOT_IN_JSON
+    tracks: NotInJson[Mapping[FilterName, FilterTracks]] = NOT_IN_JSON
+    truth: NotInJson[TableOrUnavailable] = NOT_IN_JSON
+    whole_flight_tracks: NotInJson[tuple[FilterTracks, TableOrUnavailable]] = NOT_IN_JSON
 
     @property
     def ekf2(self) -> FilterTracks:

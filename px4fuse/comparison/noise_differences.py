@@ -62,14 +62,16 @@ def _find_heading_of_largest_noise(north_and_east: Sequence[AxisComparison]) -> 
     of these changes is sin(π/2 · mean(sign(north) · sign(east))) (Blomqvist 1950).
     """
     innovations_m = [axis.kf_run.updates["innovation_m"] for axis in north_and_east]
-    changes_m = pd.concat(innovations_m, axis="columns", join="inner").diff().dropna().to_numpy()
-    changes_m = changes_m[::2]  # neighbouring changes share an innovation
-    if len(changes_m) < MIN_PART_MEASUREMENTS:
+    innovation_changes_m = (
+        pd.concat(innovations_m, axis="columns", join="inner").diff().dropna().to_numpy()
+    )
+    innovation_changes_m = innovation_changes_m[::2]  # neighbouring changes share an innovation
+    if len(innovation_changes_m) < MIN_PART_MEASUREMENTS:
         return None
-    correlation = np.sin(0.5 * np.pi * np.sign(changes_m).prod(axis=1).mean())
-    if abs(correlation) * np.sqrt(len(changes_m)) < MIN_CORRELATION_SIGMAS:
+    correlation = np.sin(0.5 * np.pi * np.sign(innovation_changes_m).prod(axis=1).mean())
+    if abs(correlation) * np.sqrt(len(innovation_changes_m)) < MIN_CORRELATION_SIGMAS:
         return None
-    north_m, east_m = np.median(np.abs(changes_m), axis=0)
+    north_m, east_m = np.median(np.abs(innovation_changes_m), axis=0)
     double_angle_rad = np.arctan2(2.0 * correlation * north_m * east_m, north_m**2 - east_m**2)
     return float(np.degrees(0.5 * double_angle_rad)) % 180.0
 

@@ -176,7 +176,7 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     """
     if name is None:
         for track in flight.positions:
-            if track.origin.is_auto_candidate:
+            if track.origin.is_selectable_by_default:
                 return track, _explain_choice(track)
         missing_source = explain_missing_source(flight)
         raise MissingDataError(f"{flight.log.name}: {missing_source.reason}", missing_source.remedy)

@@ -57,7 +57,7 @@ def remove_origin_resets(
     state = ekf2.state.copy() if resets_in_segment else ekf2.state
     removed = "removed from EKF2's track: they only move the origin of EKF2's frame"
     kept = "kept: they correct an error of EKF2"
-    resets_by_treatment: dict[str, list[str]] = {removed: [], kept: []}
+    texts_by_reset_treatment: dict[str, list[str]] = {removed: [], kept: []}
     for label, quantity, columns in (
         ("horizontal position", "position", Columns.POSITION[:2]),
         ("height", "position", Columns.POSITION[2:]),
@@ -72,7 +72,7 @@ def remove_origin_resets(
         ]
         if not resets:
             continue
-        treatment = kept
+        reset_treatment = kept
         if quantity == "position":  # a velocity does not depend on the origin
             samples = cut_to_segment(track.samples, segment)[columns].dropna()
             compute_squared_distance_m2 = partial(_compute_squared_distance_m2, samples)
@@ -81,11 +81,11 @@ def remove_origin_resets(
             if compute_squared_distance_m2(
                 closest_state
             ) < MAX_DISTANCE_RATIO_WITHOUT_RESETS * compute_squared_distance_m2(ekf2.state):
-                state[columns], treatment = closest_state, removed
-        resets_by_treatment[treatment].append(f"{len(resets)} of {label}")
+                state[columns], reset_treatment = closest_state, removed
+        texts_by_reset_treatment[reset_treatment].append(f"{len(resets)} of {label}")
     statements = (
-        f"Jumps by EKF2 resets ({', '.join(texts)}) are {treatment}"
-        for treatment, texts in resets_by_treatment.items()
+        f"Jumps by EKF2 resets ({', '.join(texts)}) are {reset_treatment}"
+        for reset_treatment, texts in texts_by_reset_treatment.items()
         if texts
     )
     return state, ". ".join(statements)
@@ -170,7 +170,7 @@ def project_fusion_horizon_position(
     if isinstance(ekf2.record, Unavailable):
         return None
     # Logs of PX4 before v1.16 contain the state at the fusion horizon
-    state = project(ekf2.record.delayed, axis, segment)
+    state = project(ekf2.record.delayed_state, axis, segment)
     positions = state[["position_m", "position_variance_m2"]].dropna()
     return positions if len(positions) else None
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from px4fuse.comparison.estimates import TuningByAxis, find_first_tuning
+from px4fuse.comparison.estimates import TuningByAxis, find_first_available_tuning
 from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import Ekf2Model, replay_with_settings
@@ -49,7 +49,9 @@ def estimate_gnss_delay_ms(
         vision is None
         or comparison.source.name != vision.source
         or comparison.convention_faults
-        or estimate_differing_delay_ms(comparison, time_offset, model.inputs.settings[EV_POS.delay])
+        or estimate_delay_if_not_as_logged_ms(
+            comparison, time_offset, model.inputs.settings[EV_POS.delay]
+        )
         is not None
         or received_positions.velocity_m_s is None
         or received_positions.uses_sender_timestamps
@@ -102,7 +104,7 @@ def estimate_ekf2_parameters(
         inputs = replace(inputs, aid=EV_POS, received_positions=vision)
     if not is_source_fused(comparison, inputs):
         return {}
-    axis_tuning = find_first_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
+    axis_tuning = find_first_available_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
     used_noise_m = find_used_noise_m(inputs)
     min_noise_m = used_noise_m if origin.may_drift or origin.is_gnss else 0.0
     if (
@@ -123,13 +125,13 @@ def is_source_fused(comparison: Comparison, ekf2_inputs: ReplayInputs) -> bool:
 def make_estimated_delay_change(
     comparison: Comparison, ekf2_inputs: ReplayInputs, time_offset: SourceTimeOffset | Unavailable
 ) -> dict[str, float]:
-    estimated_delay_ms = estimate_differing_delay_ms(
+    estimated_delay_ms = estimate_delay_if_not_as_logged_ms(
         comparison, time_offset, ekf2_inputs.settings[ekf2_inputs.aid.delay]
     )
     return {} if estimated_delay_ms is None else make_delay_change(ekf2_inputs, estimated_delay_ms)
 
 
-def estimate_differing_delay_ms(
+def estimate_delay_if_not_as_logged_ms(
     comparison: PreparedComparison,
     time_offset: SourceTimeOffset | Unavailable,
     logged_delay_ms: float,
@@ -263,7 +265,7 @@ def make_height_noise_advice(
 
     EKF2 has one noise parameter for position and height of external vision.
     """
-    ekf2, down_tuning = comparison.flight.ekf2, find_first_tuning(tuning, "down")
+    ekf2, down_tuning = comparison.flight.ekf2, find_first_available_tuning(tuning, "down")
     if (
         isinstance(ekf2, Unavailable)
         or isinstance(ekf2.fusion_flags, Unavailable)

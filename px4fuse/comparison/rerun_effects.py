@@ -28,16 +28,18 @@ MIN_REPORTED_NEES = 4.0
 MIN_OVERCONFIDENT_NEES_AFTER_CHANGE = 2.0
 # A change is a possible cause of a wrong σ if its re-run removes 50 % to 150 % of ln(mean NIS) or
 # ln(mean NEES). A removal of 100 % makes the filter consistent
-POSSIBLE_CAUSE_FRACTION_TOLERANCE = 0.5
+POSSIBLE_CAUSE_EXPLAINED_FRACTION_TOLERANCE = 0.5
 # A sensor fault is the only cause of a wrong σ if its correction removes 75 % to 125 % of
 # ln(mean NIS) or ln(mean NEES)
-ONLY_CAUSE_FRACTION_TOLERANCE = 0.25
+ONLY_CAUSE_EXPLAINED_FRACTION_TOLERANCE = 0.25
 # A change is combined with another change if its re-run removes 10 % to 190 % of ln(mean NIS) or
 # ln(mean NEES)
-COMBINED_CHANGE_FRACTION_TOLERANCE = 0.9
+COMBINED_CHANGE_EXPLAINED_FRACTION_TOLERANCE = 0.9
 SENSOR_CORRECTION_KEYS = frozenset((OUTLIERS_KEY, TIME_OFFSET_KEY, ROTATION_KEY, FORWARD_BIAS_KEY))
 # Changes that have an effect only together with another change
-SECONDARY_CHANGE_KEYS = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode_parameter, RIGHT_BIAS_KEY))
+CHANGE_KEYS_WITHOUT_EFFECT_ALONE = frozenset(
+    ("EKF2_DELAY_MAX", EV_POS.noise_mode_parameter, RIGHT_BIAS_KEY)
+)
 # A re-run has an effect if it changes a σ ratio by at least this factor
 MIN_SIGMA_RATIO_CHANGE_FACTOR = 1.10
 # A re-run has an effect if it changes the position RMSE by more than this fraction
@@ -160,11 +162,12 @@ def find_cause_rerun(
     def rank(rerun: Rerun) -> tuple[bool, int, bool, float]:
         explained_fraction_error = _compute_explained_fraction_error(rerun, statistic)
         is_complete = (
-            rerun.corrects_sensor and explained_fraction_error <= ONLY_CAUSE_FRACTION_TOLERANCE
+            rerun.corrects_sensor
+            and explained_fraction_error <= ONLY_CAUSE_EXPLAINED_FRACTION_TOLERANCE
         )
         return (
             not (is_complete or brings_inside_limits(rerun, statistic)),
-            len(rerun.change.keys() - SECONDARY_CHANGE_KEYS),
+            len(rerun.change.keys() - CHANGE_KEYS_WITHOUT_EFFECT_ALONE),
             not rerun.corrects_sensor,
             explained_fraction_error,
         )
@@ -172,7 +175,8 @@ def find_cause_rerun(
     causes = (
         rerun
         for rerun in find_reruns(reruns, filter_name, axis, statistic)
-        if _compute_explained_fraction_error(rerun, statistic) <= POSSIBLE_CAUSE_FRACTION_TOLERANCE
+        if _compute_explained_fraction_error(rerun, statistic)
+        <= POSSIBLE_CAUSE_EXPLAINED_FRACTION_TOLERANCE
         and not makes_overconfident(rerun, statistic)
     )
     return min(causes, key=rank, default=None)
@@ -184,7 +188,8 @@ def find_partial_corrections(reruns: Iterable[Rerun], statistic: Statistic) -> l
         rerun
         for rerun in reruns
         if statistic in rerun.discrepancies
-        and _compute_explained_fraction_error(rerun, statistic) < COMBINED_CHANGE_FRACTION_TOLERANCE
+        and _compute_explained_fraction_error(rerun, statistic)
+        < COMBINED_CHANGE_EXPLAINED_FRACTION_TOLERANCE
     ]
     candidates.sort(key=lambda rerun: _compute_explained_fraction_error(rerun, statistic))
     return [] if any(brings_inside_limits(rerun, statistic) for rerun in candidates) else candidates

@@ -77,7 +77,7 @@ from px4fuse.flight.model import Columns, Spans, Unavailable
 MAX_NORMAL_NIS = 1.5
 # Re-runs of EKF2 are compared with the log if the unchanged replay and the log differ by at most
 # this factor in RMSE and σ ratio, and otherwise with the unchanged replay
-MAX_REPLAYED_TO_LOGGED_RATIO = 1.10
+MAX_REPLAYED_TO_LOGGED_ERROR_RATIO = 1.10
 
 
 class ErrorAboveSigma(NamedTuple):
@@ -296,9 +296,9 @@ def _find_statistics_without_change(
     is_replay_similar = all(
         logged_value and replayed_value and 1.0 / limit <= logged_value / replayed_value <= limit
         for logged_value, replayed_value, limit in (
-            (logged.position_rmse_m, replayed.position_rmse_m, MAX_REPLAYED_TO_LOGGED_RATIO),
-            (logged.nis_mean, replayed.nis_mean, MAX_REPLAYED_TO_LOGGED_RATIO**2),
-            (logged.nees_mean, replayed.nees_mean, MAX_REPLAYED_TO_LOGGED_RATIO**2),
+            (logged.position_rmse_m, replayed.position_rmse_m, MAX_REPLAYED_TO_LOGGED_ERROR_RATIO),
+            (logged.nis_mean, replayed.nis_mean, MAX_REPLAYED_TO_LOGGED_ERROR_RATIO**2),
+            (logged.nees_mean, replayed.nees_mean, MAX_REPLAYED_TO_LOGGED_ERROR_RATIO**2),
         )
         if logged_value is not None
     )

@@ -46,7 +46,7 @@ SMALL_ROTATION_LOG_PRIOR_ODDS = -0.5
 # Log prior odds of a time offset above SMALL_TIME_OFFSET_S
 LARGE_TIME_OFFSET_LOG_PRIOR_ODDS = -2.0
 # Log prior odds of a unit other than metres
-OTHER_UNIT_LOG_PRIOR_ODDS = -2.0
+UNIT_OTHER_THAN_METRES_LOG_PRIOR_ODDS = -2.0
 # σ (m) of barometer heights
 BAROMETER_SIGMA_M = 0.5
 # Assumed number of independent height errors in a flight
@@ -55,7 +55,7 @@ INDEPENDENT_HEIGHT_ERROR_COUNT = 6.0
 MAX_HEIGHT_ERROR_M = 20.0 * BAROMETER_SIGMA_M
 MAX_REFINED_HYPOTHESES = 8
 # Maximum log-likelihood (nats) below that of the best hypothesis, to refine a hypothesis
-MAX_SCORE_BELOW_BEST_TO_REFINE = 60.0
+MAX_SCORE_DEFICIT_OF_REFINED_HYPOTHESES = 60.0
 # Maximum number of second differences in one least-squares fit, to limit the computing time
 MAX_REFINEMENT_ROWS = 1200
 MAX_REFINEMENT_ITERATIONS = 7
@@ -247,20 +247,23 @@ def find_convention_candidates(
     source_motion: SourceSecondDifferences, imu_motion: ImuSecondDifferences
 ) -> list[Hypothesis]:
     """Return the likely combinations of axes, unit and time offset, most likely first."""
-    source_moment_terms = np.column_stack(
+    source_columns_for_cross_moments = np.column_stack(
         [
             source_motion.second_differences,
             source_motion.second_differences**2,
             source_motion.is_valid,
         ]
     )
-    imu_moment_terms = np.column_stack(
+    imu_columns_for_cross_moments = np.column_stack(
         [imu_motion.table[..., 0], imu_motion.table[..., 0] ** 2, imu_motion.is_valid]
     )
-    offset_steps = np.arange(len(source_moment_terms) - len(imu_moment_terms) + 1)
+    offset_steps = np.arange(
+        len(source_columns_for_cross_moments) - len(imu_columns_for_cross_moments) + 1
+    )
     cross_moments = np.stack(
         [
-            source_moment_terms[step : step + len(imu_moment_terms)].T @ imu_moment_terms
+            source_columns_for_cross_moments[step : step + len(imu_columns_for_cross_moments)].T
+            @ imu_columns_for_cross_moments
             for step in offset_steps
         ]
     )
@@ -284,10 +287,10 @@ def find_convention_candidates(
         np.transpose(permutations)
     )
     # Complex numbers are north + i east
-    horizontal_moments = cross_moments[:, :3, 0] + 1j * cross_moments[:, :3, 1]
+    horizontal_cross_moments = cross_moments[:, :3, 0] + 1j * cross_moments[:, :3, 1]
     correlation = (
-        horizontal_moments[:, first_horizontal_axis]
-        - 1j * handedness * horizontal_moments[:, second_horizontal_axis]
+        horizontal_cross_moments[:, first_horizontal_axis]
+        - 1j * handedness * horizontal_cross_moments[:, second_horizontal_axis]
     )
     source_mean_square = np.maximum(cross_moments[:, 3:6, 6, None], 1e-12)
     metres_per_unit = np.array([*METRES_PER_UNIT.values()])
@@ -331,7 +334,7 @@ def find_convention_candidates(
             total_score = (
                 scores_at_quarter_turn[offset_index, permutation_index, unit_index]
                 + axis_permutation.compute_log_prior_odds(quarter_turns)
-                + OTHER_UNIT_LOG_PRIOR_ODDS * (unit_name != "m")
+                + UNIT_OTHER_THAN_METRES_LOG_PRIOR_ODDS * (unit_name != "m")
             )
             parameters = np.array(
                 [delay_s[offset_index], rotation_rad[offset_index, permutation_index], *[0.0] * 5]
@@ -343,7 +346,7 @@ def find_convention_candidates(
     return [
         hypothesis
         for hypothesis in hypotheses[:MAX_REFINED_HYPOTHESES]
-        if hypothesis.score > hypotheses[0].score - MAX_SCORE_BELOW_BEST_TO_REFINE
+        if hypothesis.score > hypotheses[0].score - MAX_SCORE_DEFICIT_OF_REFINED_HYPOTHESES
     ]
 
 
@@ -512,7 +515,7 @@ def _fit_student_distributions(
 def _compute_total_log_odds(hypothesis: Hypothesis, positions: SentPositions) -> float:
     """Return the log prior odds of a hypothesis plus the log likelihood ratio of the heights."""
     log_odds = hypothesis.axis_permutation.compute_log_prior_odds(hypothesis.quarter_turns)
-    log_odds += OTHER_UNIT_LOG_PRIOR_ODDS * (hypothesis.unit != "m")
+    log_odds += UNIT_OTHER_THAN_METRES_LOG_PRIOR_ODDS * (hypothesis.unit != "m")
     log_odds += LARGE_TIME_OFFSET_LOG_PRIOR_ODDS * (abs(hypothesis.delay_s) > SMALL_TIME_OFFSET_S)
     if hypothesis.has_rotation:
         # Bayesian information criterion: one more estimated parameter costs ½ ln n

@@ -402,11 +402,11 @@ def _check_orientation(
     )
     imu_motion = replace(imu_motion, is_valid=imu_motion.is_valid & is_covered)
     # Headings (°) of the x axis of the positions if the source's orientation has no heading error
-    correct_headings_deg = {"FLU to ENU": [90.0], "FLU to NWU": [0.0]}.get(
+    expected_x_axis_headings_deg = {"FLU to ENU": [90.0], "FLU to NWU": [0.0]}.get(
         convention.frames, [0.0, 90.0]
     )
     if best_hypothesis.axis_permutation.vertical_sign > 0:
-        correct_headings_deg = [0.0]
+        expected_x_axis_headings_deg = [0.0]
     axes_and_unit = best_hypothesis.axis_permutation, best_hypothesis.unit
     for hypothesis in search_hypotheses(positions, {"EKF2": imu_motion}):
         if hypothesis.has_rotation and axes_and_unit == (
@@ -415,8 +415,8 @@ def _check_orientation(
         ):
             x_heading_deg = float(np.degrees(hypothesis.parameters[1]))
             heading_errors_deg = (
-                (x_heading_deg - correct_heading_deg + 180.0) % 360.0 - 180.0
-                for correct_heading_deg in correct_headings_deg
+                (x_heading_deg - expected_x_axis_heading_deg + 180.0) % 360.0 - 180.0
+                for expected_x_axis_heading_deg in expected_x_axis_headings_deg
             )
             return structs.replace(convention, heading_error_deg=min(heading_errors_deg, key=abs))
     return convention

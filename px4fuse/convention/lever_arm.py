@@ -32,7 +32,7 @@ MIN_SINGULAR_VALUE_RATIO = 0.02
 MIN_COORDINATE_COUNT = 40
 LEVER_ARM_FIT_COUNT = 4
 # Minimum RMS distance (m) from the middle of the path, to fit a rotation
-MIN_PATH_RADIUS_M = 0.01
+MIN_RMS_DISTANCE_FROM_PATH_MEAN_M = 0.01
 IMU_POSITION_PARAMETERS = ("EKF2_IMU_POS_X", "EKF2_IMU_POS_Y", "EKF2_IMU_POS_Z")
 
 
@@ -91,12 +91,14 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
     )
     # Fit a delay and a rotation too, because they resemble a lever arm
     velocity_m_s = np.gradient(true_positions_m, time_s, axis=0)
-    error_per_rotation_m = _rotate(true_positions_m - np.nanmean(true_positions_m, axis=0), 90.0)
-    path_radius_m = max(float(np.sqrt(np.nanmean(error_per_rotation_m**2))), MIN_PATH_RADIUS_M)
-    error_per_rotation_m /= path_radius_m
+    error_per_radian_m = _rotate(true_positions_m - np.nanmean(true_positions_m, axis=0), 90.0)
+    rms_distance_from_path_mean_m = max(
+        float(np.sqrt(np.nanmean(error_per_radian_m**2))), MIN_RMS_DISTANCE_FROM_PATH_MEAN_M
+    )
+    error_per_radian_m /= rms_distance_from_path_mean_m
     rotation = to_matrix(interpolate_attitude(attitude, time_s))[:, :2, :2]
     offset_columns = np.broadcast_to(np.eye(2), rotation.shape)
-    motion_columns = np.stack([velocity_m_s, error_per_rotation_m], axis=2)
+    motion_columns = np.stack([velocity_m_s, error_per_radian_m], axis=2)
     design = np.concatenate([rotation, offset_columns, motion_columns], axis=2)
     is_known = np.isfinite(velocity_m_s).all(axis=1)
     design_rows = design[is_known].reshape(-1, 6)
@@ -111,7 +113,7 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
         )
         if rank < design_rows.shape[1]:  # with a constant heading, a lever arm is an offset
             return None
-        rotation_deg += float(np.degrees(fitted_parameters[5])) / path_radius_m
+        rotation_deg += float(np.degrees(fitted_parameters[5])) / rms_distance_from_path_mean_m
     residual_m = (valid_position_errors_m - design_rows @ fitted_parameters).reshape(-1, 2)
     # Successive errors of a source may be correlated
     variance_factor = max(map(compute_autocorrelation_time, residual_m.T))
@@ -119,7 +121,9 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
         np.linalg.inv(design_rows.T @ design_rows) * np.mean(residual_m**2) * variance_factor
     )
     lever_arm = _make_lever_arm(fitted_parameters, covariance, rotation_deg)
-    lever_arm = lever_arm._replace(rotation_sigma_deg=lever_arm.rotation_sigma_deg / path_radius_m)
+    lever_arm = lever_arm._replace(
+        rotation_sigma_deg=lever_arm.rotation_sigma_deg / rms_distance_from_path_mean_m
+    )
     min_length_m = max(
         MIN_LEVER_ARM_WITH_TRUTH_M, MIN_LEVER_ARM_SIGMAS_WITH_TRUTH * lever_arm.sigma_m
     )

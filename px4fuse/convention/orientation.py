@@ -50,7 +50,7 @@ MAX_HEADING_DIFFERENCE_DEG = 12.0
 # they are noise
 MIN_ANGLE_DIFFERENCE_IN_SCORE_DEG = 0.7
 # The score of a convention decreases by this factor · duration (s) · ln(median angle difference)
-SCORE_WEIGHT_PER_S = 0.5
+ANGLE_DIFFERENCE_WEIGHT_PER_S = 0.5
 # For the verdict "determined", the score of the best convention must exceed that of the second best
 # by this value
 MIN_CONVENTION_SCORE_LEAD = 4.0
@@ -66,7 +66,7 @@ class OrientationCandidate(NamedTuple):
     score: float
 
     @property
-    def order_and_heading_free_frames(self) -> tuple[str, str]:
+    def order_and_frames_up_to_heading(self) -> tuple[str, str]:
         """Quaternion order, body frame and world frame; ENU counts as NWU.
 
         ENU and NWU differ only in heading.
@@ -123,7 +123,7 @@ def check_orientation(
     second_best_candidate = next(
         candidate
         for candidate in candidates
-        if candidate.order_and_heading_free_frames != best_candidate.order_and_heading_free_frames
+        if candidate.order_and_frames_up_to_heading != best_candidate.order_and_frames_up_to_heading
     )
     orientation_convention = best_candidate.convention
     if (
@@ -177,7 +177,9 @@ def _score_convention(
     log_angle_differences = np.log(
         np.maximum([tilt_difference_deg, heading_difference_deg], MIN_ANGLE_DIFFERENCE_IN_SCORE_DEG)
     )
-    score = -SCORE_WEIGHT_PER_S * (time_s[-1] - time_s[0]) * np.sum(log_angle_differences)
+    score = (
+        -ANGLE_DIFFERENCE_WEIGHT_PER_S * (time_s[-1] - time_s[0]) * np.sum(log_angle_differences)
+    )
     score -= 4.0 * (order != "w x y z") + 2.0 * (frames != "FRD to NED")
     score -= 2.0 * (body_quarter_turns != 0) + 1.0 * (
         abs(mean_heading_difference_rad) > np.radians(8.0)

@@ -16,43 +16,43 @@ _FileIdentity = tuple[int, int] | str
 
 
 # Input files and folders of the running command
-_input_by_identity: ContextVar[dict[_FileIdentity | None, Path] | None] = ContextVar(
-    "input_by_identity", default=None
+_input_path_by_file_id: ContextVar[dict[_FileIdentity | None, Path] | None] = ContextVar(
+    "input_path_by_file_id", default=None
 )
 
 
 @contextmanager
 def protect_inputs() -> Iterator[None]:
     """Register all files that are read in this context, so that no output overwrites them."""
-    context_token = _input_by_identity.set({})
+    context_token = _input_path_by_file_id.set({})
     try:
         yield
     finally:
-        _input_by_identity.reset(context_token)
+        _input_path_by_file_id.reset(context_token)
 
 
 @contextmanager
 def suspend_input_registration() -> Iterator[None]:
     """Allow outputs to overwrite files that are read in this context."""
-    context_token = _input_by_identity.set(None)
+    context_token = _input_path_by_file_id.set(None)
     try:
         yield
     finally:
-        _input_by_identity.reset(context_token)
+        _input_path_by_file_id.reset(context_token)
 
 
 def add_input(path: Path) -> None:
     """Register an input file or folder, so that no output overwrites it."""
-    input_by_identity = _input_by_identity.get()
-    if input_by_identity is not None and (identity := _read_file_identity(path)) is not None:
-        input_by_identity.setdefault(identity, path)
+    input_path_by_file_id = _input_path_by_file_id.get()
+    if input_path_by_file_id is not None and (identity := _read_file_identity(path)) is not None:
+        input_path_by_file_id.setdefault(identity, path)
 
 
 def check_outputs(output_paths: Iterable[Path]) -> None:
     """Raise an OutputError if an output path is an input file or folder of this command."""
-    input_by_identity = _input_by_identity.get() or {}
+    input_path_by_file_id = _input_path_by_file_id.get() or {}
     for output_path in output_paths:
-        if _read_file_identity(output_path) in input_by_identity:
+        if _read_file_identity(output_path) in input_path_by_file_id:
             raise OutputError(
                 f"{output_path} is an input of this command and was not overwritten. Choose "
                 "another output name."
@@ -65,17 +65,19 @@ def check_output_folder(folder: Path) -> None:
         raise OutputError(
             f"{folder} is a file, but the output needs a folder. Choose another name."
         )
-    input_by_identity = {**(_input_by_identity.get() or {})}
+    input_path_by_file_id = {**(_input_path_by_file_id.get() or {})}
     input_by_folder = {
         input_folder: path
-        for path in input_by_identity.values()
+        for path in input_path_by_file_id.values()
         for input_folder in (*path.absolute().parents, *path.resolve().parents)
     }
-    input_by_identity |= {_read_file_identity(key): path for key, path in input_by_folder.items()}
-    input_by_identity.pop(None, None)  # None is the key of folders that no longer exist
+    input_path_by_file_id |= {
+        _read_file_identity(key): path for key, path in input_by_folder.items()
+    }
+    input_path_by_file_id.pop(None, None)  # None is the key of folders that no longer exist
     entries = _list_folder(folder)
     for path in (folder, *entries, *(child for entry in entries for child in _list_folder(entry))):
-        input_path = input_by_identity.get(_read_file_identity(path))
+        input_path = input_path_by_file_id.get(_read_file_identity(path))
         if input_path is not None:
             raise OutputError(
                 f"the output folder {folder} contains {input_path}, an input of this command",

@@ -65,7 +65,7 @@ Vector = tuple[float, float, float]
 
 
 # Default value of fields that are not written to the JSON results
-NOT_WRITTEN: Any = msgspec.UNSET
+NOT_IN_JSON: Any = msgspec.UNSET
 
 
 # type checkers report assignments to fields of subclasses
@@ -105,10 +105,10 @@ A = TypeVar("A")
 if TYPE_CHECKING:
     RecordOrUnavailable: TypeAlias = Union[T, A]  # noqa: UP007 - generic alias
     OrUnavailable: TypeAlias = Union[T, Unavailable]  # noqa: UP007
-    NotWritten: TypeAlias = Annotated[T, "not written"]
+    NotInJson: TypeAlias = Annotated[T, "not written"]
 else:
 
-    class NotWritten:
+    class NotInJson:
         """Type of fields, such as arrays, that are not written to the JSON results."""
 
         def __class_getitem__(cls, kind: object) -> type:
@@ -120,11 +120,13 @@ else:
         msgspec cannot decode this union; :func:`decode_record_or_unavailable` does.
         """
 
-        def __class_getitem__(cls, kinds: tuple[type, type]) -> type:
+        def __class_getitem__(cls, member_types: tuple[type, type]) -> type:
             union_class = ABCMeta(
-                "Or".join(kind.__name__ for kind in kinds), (), {"union_members": kinds}
+                "Or".join(kind.__name__ for kind in member_types),
+                (),
+                {"union_members": member_types},
             )
-            for kind in kinds:
+            for kind in member_types:
                 union_class.register(kind)
             return union_class
 

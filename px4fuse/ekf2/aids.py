@@ -328,9 +328,11 @@ def _find_noise_origin(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> 
 
 
 def _find_longest_gap(fusion_times_s: Array, aid_log: AidLog, start_s: float, end_s: float) -> Span:
-    unknown_times_s = aid_log.times_with_unknown_fusion_s
-    is_inside = (unknown_times_s > start_s) & (unknown_times_s < end_s)
-    gap_limits_s = np.unique(np.r_[start_s, fusion_times_s, end_s, unknown_times_s[is_inside]])
+    times_with_unknown_fusion_s = aid_log.times_with_unknown_fusion_s
+    is_inside = (times_with_unknown_fusion_s > start_s) & (times_with_unknown_fusion_s < end_s)
+    gap_limits_s = np.unique(
+        np.r_[start_s, fusion_times_s, end_s, times_with_unknown_fusion_s[is_inside]]
+    )
     # EKF2 disables an aiding source up to 1 s after the last fused sample
     is_enabled = _was_enabled(aid_log, gap_limits_s[:-1] + 1.0)
     longest_index = int(np.argmax(np.diff(gap_limits_s) * is_enabled))

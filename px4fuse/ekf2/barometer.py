@@ -12,7 +12,7 @@ import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray, integrate_cumulatively
 from px4fuse.ekf2.bias import POSITION_BIAS_NOISE_M_PER_SQRT_S
-from px4fuse.ekf2.replay_segments import INNOVATION_TIME_CONSTANT_S
+from px4fuse.ekf2.replay_segments import INNOVATION_LOW_PASS_TIME_CONSTANT_S
 from px4fuse.flight.ekf2_parameters import BAROMETER
 from px4fuse.flight.model import GROUND_EFFECT_FLAG, Ekf2, FusionRecord
 
@@ -32,7 +32,7 @@ MAX_SAMPLES_BETWEEN_LOGGED_ROWS = 30
 # missing in the log
 MAX_BAROMETER_SAMPLE_WEIGHT = 4.0
 # Lower limit of a sum of low-pass filter weights, to avoid a division by zero
-MIN_MISSING_WEIGHT_SUM = 1e-9
+MIN_WEIGHT_SUM_OF_MISSING_SAMPLES = 1e-9
 
 
 def estimate_barometer_interval_s(fusion_record: FusionRecord) -> float:
@@ -54,7 +54,7 @@ def estimate_barometer_interval_s(fusion_record: FusionRecord) -> float:
         if upper_quartile_s - lower_quartile_s < MAX_RELATIVE_SPREAD_OF_INTERVALS * median_s:
             return float(median_s)
     return 1.0 / (
-        BAROMETER_HZ_BEFORE_V1_15 if fusion_record.stores_bias_increments else BAROMETER_HZ
+        BAROMETER_HZ_BEFORE_V1_15 if fusion_record.has_delta_angle_biases else BAROMETER_HZ
     )
 
 
@@ -118,11 +118,11 @@ def _combine_barometer_samples(
     rows_outside_ground_effect = logged_barometer_updates[
         ~fusion_record.was_flag_set(GROUND_EFFECT_FLAG, row_times_s)
     ]
-    predicted_minus_integrated_down_m = (
+    predicted_minus_velocity_integral_down_m = (
         rows_outside_ground_effect["observation_down"]
         - rows_outside_ground_effect["innovation_down"]
     )
-    predicted_minus_integrated_down_m -= np.interp(
+    predicted_minus_velocity_integral_down_m -= np.interp(
         rows_outside_ground_effect.index, velocity_times_s, displacement_m
     )
 
@@ -132,7 +132,7 @@ def _combine_barometer_samples(
     def predict_measured_down_m(time_s: Array) -> Array:
         """Return EKF2's predicted barometer measurement (m, down)."""
         predicted_down_m = np.interp(
-            time_s, rows_outside_ground_effect.index, predicted_minus_integrated_down_m
+            time_s, rows_outside_ground_effect.index, predicted_minus_velocity_integral_down_m
         ) + np.interp(time_s, velocity_times_s, displacement_m)
         return predicted_down_m - interpolate_bias_m(time_s)
 
@@ -175,7 +175,7 @@ def _combine_barometer_samples(
     ] = (down_m - predict_measured_down_m(time_s))[is_on_sample_grid]
     if "filtered_down" in logged_barometer_updates:
         # PX4 logs the filtered innovation with the opposite sign: state minus measurement
-        filtered_nu_m = -logged_barometer_updates["filtered_down"].to_numpy()
+        low_pass_filtered_innovation_m = -logged_barometer_updates["filtered_down"].to_numpy()
         age_in_samples = sample_count[:, None] - 1.0 - sample_indices
         is_missing = np.isnan(innovation_m) & (age_in_samples >= 0.0) & is_regular[:, None]
         innovation_m = _simulate_missing_innovations(
@@ -183,7 +183,7 @@ def _combine_barometer_samples(
             is_missing,
             sample_interval_by_row_s[:, None],
             age_in_samples,
-            filtered_nu_m,
+            low_pass_filtered_innovation_m,
         )
     sample_times_s = row_times_s[:-1, None] + sample_interval_by_row_s[:, None] * (
         sample_indices + 1
@@ -209,7 +209,7 @@ def _simulate_missing_innovations(
     is_missing: BoolArray,
     interval_s: Array,
     age_in_samples: Array,
-    filtered_nu_m: Array,
+    low_pass_filtered_innovation_m: Array,
 ) -> Array:
     """Replace missing innovations by random values that agree with the logged filtered innovation.
 
@@ -221,10 +221,10 @@ def _simulate_missing_innovations(
         Sample interval.
     age_in_samples : ndarray, shape (n, k)
         Number of samples from each sample to the next logged row.
-    filtered_nu_m : ndarray, shape (n + 1,)
+    low_pass_filtered_innovation_m : ndarray, shape (n + 1,)
         Logged low-pass filtered innovations.
     """
-    new_sample_weight = interval_s / (interval_s + INNOVATION_TIME_CONSTANT_S)
+    new_sample_weight = interval_s / (interval_s + INNOVATION_LOW_PASS_TIME_CONSTANT_S)
     low_pass_weight = new_sample_weight * (1.0 - new_sample_weight) ** np.maximum(
         age_in_samples, 0.0
     )
@@ -232,17 +232,19 @@ def _simulate_missing_innovations(
     simulated_innovation_m = np.random.default_rng(0).normal(
         scale=np.nanstd(innovation_m), size=innovation_m.shape
     )
-    previous_filtered_nu_weight = (1.0 - new_sample_weight[:, 0]) ** (age_in_samples[:, 0] + 1.0)
+    previous_filtered_innovation_weight = (1.0 - new_sample_weight[:, 0]) ** (
+        age_in_samples[:, 0] + 1.0
+    )
     low_pass_weighted_sum_m = np.nansum(low_pass_weight * innovation_m, axis=1) + (
         low_pass_weight_if_missing * simulated_innovation_m
     ).sum(axis=1)
     simulated_innovation_offset_m = (
-        filtered_nu_m[1:]
-        - previous_filtered_nu_weight * filtered_nu_m[:-1]
+        low_pass_filtered_innovation_m[1:]
+        - previous_filtered_innovation_weight * low_pass_filtered_innovation_m[:-1]
         - low_pass_weighted_sum_m
     )
     simulated_innovation_offset_m /= np.maximum(
-        low_pass_weight_if_missing.sum(axis=1), MIN_MISSING_WEIGHT_SUM
+        low_pass_weight_if_missing.sum(axis=1), MIN_WEIGHT_SUM_OF_MISSING_SAMPLES
     )
     return np.where(
         is_missing, simulated_innovation_m + simulated_innovation_offset_m[:, None], innovation_m

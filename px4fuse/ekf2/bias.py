@@ -20,7 +20,7 @@ POSITION_BIAS_GATE = 3.0
 # bias_estimator.cpp)
 MAX_MEAN_TEST_RATIO_OF_VALID_BIAS = 0.2
 # Factor on the random walk variance of a bias that EKF2 considers wrong
-VARIANCE_FACTOR_FOR_WRONG_BIAS = 1e3
+RANDOM_WALK_VARIANCE_FACTOR_OF_WRONG_BIAS = 1e3
 # Time constant (s) of the low-pass filter of the test ratio
 TEST_RATIO_TIME_CONSTANT_S = 10.0
 
@@ -68,7 +68,7 @@ class BiasEstimator:
         is_bias_wrong = np.abs(self.mean_signed_test_ratio) > MAX_MEAN_TEST_RATIO_OF_VALID_BIAS
         bias_noise_m2_per_s = np.where(
             is_bias_wrong,
-            VARIANCE_FACTOR_FOR_WRONG_BIAS * POSITION_BIAS_NOISE_M_PER_SQRT_S**2,
+            RANDOM_WALK_VARIANCE_FACTOR_OF_WRONG_BIAS * POSITION_BIAS_NOISE_M_PER_SQRT_S**2,
             POSITION_BIAS_NOISE_M_PER_SQRT_S**2,
         )
         bias_variance = np.minimum(self.variance_m2 + bias_noise_m2_per_s * interval_s, R_m2)

@@ -157,7 +157,7 @@ class FilterConfiguration:
         delay_s = self.settings[inputs.aid.delay] * 1e-3
         max_delay_ms = max(self.settings.get(aid.delay, 0.0) for aid in (GNSS_POS, EV_POS))
         min_horizon_s = inputs.horizon_s
-        if not inputs.rules.is_horizon_largest_delay:
+        if not inputs.rules.is_horizon_set_by_largest_delay:
             # EKF2 raises EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp)
             max_delay_ms = max(max_delay_ms, self.settings["EKF2_DELAY_MAX"])
             if max_delay_ms == inputs.settings["EKF2_DELAY_MAX"]:
@@ -334,7 +334,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             segment, vision_samples, is_enabled_by_aid, parameters, has_gate, uses_reported_noise
         )
     gyro_variance = (estimates_attitude * parameters["EKF2_GYR_NOISE"] ** 2)[:, None, None]
-    variance_growth_per_step, max_variance_for_growth = _compute_variance_growth(
+    variance_growth_per_step, max_variance_with_process_noise = _compute_variance_growth(
         inputs, segment, parameters, estimates_biases, estimates_attitude
     )
     step_counts = np.diff(event_steps, axis=0, prepend=0)
@@ -366,7 +366,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         inputs.rules,
         segment.time_s[0],
         np.where(is_aid_enabled, action, NO_ACTION),
-        events["can_start"] & is_aid_enabled,
+        events["can_start_fusion"] & is_aid_enabled,
         event_time_s,
         has_gate,
         uses_logged_decisions,
@@ -400,14 +400,14 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             transitions = {one: one.compute_transitions(event_batch) for one in set(intervals)}
             (
                 transition,
-                state_change_by_correction,
+                state_change_by_attitude_correction,
                 state_change_by_acceleration,
                 gyro_noise_covariance,
                 accelerometer_noise_covariance,
             ) = _stack_by_filter([transitions[one] for one in intervals])
             state_change = (
                 state_change_by_acceleration
-                + estimates_attitude[:, None] * state_change_by_correction
+                + estimates_attitude[:, None] * state_change_by_attitude_correction
             )
             process_noise = (
                 gyro_variance * gyro_noise_covariance
@@ -435,7 +435,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         bias_before_fusion = x[:, ACCELEROMETER_BIAS].copy()
         bias_covariance = P[:, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS].copy()
         bias_variance = _get_state_variances(P)[:, BIASES.start :]
-        bias_variance += (bias_variance < max_variance_for_growth) * (
+        bias_variance += (bias_variance < max_variance_with_process_noise) * (
             variance_growth_per_step * step_counts[event, :, None]
         )
         if min_bias_variance := inputs.rules.min_accelerometer_bias_variance_m2_s4:
@@ -636,7 +636,7 @@ class _FusionDecisions:
     fusion_rules: FusionRules
     start_s: float
     sample_actions: IntArray
-    can_start: BoolArray
+    can_start_fusion: BoolArray
     time_s: Array
     has_gate: BoolArray
     uses_logged_decisions: BoolArray
@@ -690,7 +690,7 @@ class _FusionDecisions:
                 & ~self.logged_resets[next_event]
             )
         is_fusion_starting = self.has_gate & (
-            (action == START_FUSION) | (self.is_stopped & self.can_start[event])
+            (action == START_FUSION) | (self.is_stopped & self.can_start_fusion[event])
         )
         time_since_fusion_s = now_s - self.last_position_s
         is_rejection_timed_out = (
@@ -738,13 +738,13 @@ def _compute_variance_growth(
     variance exceeds the maximum.
     """
     vector_count = 2 if segment.magnetic_field is None else 4
-    noise_density, max_sigma_for_growth = (
+    noise_density, max_sigma_with_process_noise = (
         np.repeat([parameters[f"EKF2_{name}_NOISE"] for name in names[:vector_count]], 3, axis=0).T
         for names in (("GYR_B", "ACC_B", "MAG_E", "MAG_B"), ("GYR", "ACC", "MAG", "MAG"))
     )
     noise_density[:, :3] *= estimates_attitude[:, None]
     noise_density[:, 3:6] *= estimates_biases[:, None]
-    return (noise_density * inputs.mean_step_s) ** 2, max_sigma_for_growth**2
+    return (noise_density * inputs.mean_step_s) ** 2, max_sigma_with_process_noise**2
 
 
 def estimate_state_correlation(inputs: ReplayInputs, segment: ReplaySegment) -> ReplaySegment:

@@ -44,17 +44,20 @@ CLOCK_SYNCHRONISATION_ACTION = (
     "Synchronise the clocks: set UXRCE_DDS_SYNCT to 1 (uXRCE-DDS agent), or answer MAVLink "
     "TIMESYNC messages. Send timestamps in microseconds."
 )
-TOO_OLD_EFFECT = "The position timestamps are too old for EKF2."
-AHEAD_EFFECT = "The position timestamps are ahead of EKF2's clock."
+EFFECT_OF_TOO_OLD_TIMESTAMPS = "The position timestamps are too old for EKF2."
+EFFECT_OF_TIMESTAMPS_AHEAD_OF_CLOCK = "The position timestamps are ahead of EKF2's clock."
 # Effect on EKF2 of timestamps in a wrong unit
 EFFECT_BY_WRONG_UNIT = {
-    **dict.fromkeys(("0", "milliseconds", "seconds"), TOO_OLD_EFFECT),
-    "nanoseconds": AHEAD_EFFECT,
+    **dict.fromkeys(("0", "milliseconds", "seconds"), EFFECT_OF_TOO_OLD_TIMESTAMPS),
+    "nanoseconds": EFFECT_OF_TIMESTAMPS_AHEAD_OF_CLOCK,
 }
 # Effect on EKF2 of unusable timestamps, by their clock or unit
 EFFECT_BY_UNUSABLE_TIMESTAMP = {
     **EFFECT_BY_WRONG_UNIT,
-    **{f"UNIX time in {unit}seconds": AHEAD_EFFECT for unit in ("nano", "micro", "milli")},
+    **{
+        f"UNIX time in {unit}seconds": EFFECT_OF_TIMESTAMPS_AHEAD_OF_CLOCK
+        for unit in ("nano", "micro", "milli")
+    },
     **dict.fromkeys(
         ("another clock", "an unknown clock", "UNIX time in seconds"),
         "The position timestamps are too old for EKF2, or ahead of EKF2's clock.",

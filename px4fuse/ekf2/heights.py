@@ -98,7 +98,7 @@ def add_heights(
         GROUND_EFFECT_FLAG, sample_times_s
     ) * parameters.get("EKF2_GND_EFF_DZ", DEFAULT_GROUND_EFFECT_DEAD_ZONE_M)
     segments_with_heights = []
-    delayed_down_m = fusion_record.delayed["down_m"]
+    delayed_down_m = fusion_record.delayed_state["down_m"]
     for segment in segments:
         start_s = float(segment.time_s[0])
         bias_and_variance = np.zeros(2)
@@ -179,9 +179,9 @@ class BadAccelerationFlag:
         """
         if len(self.logged_spans_s):
             last_row = np.searchsorted(self.logged_spans_s[:, 0], end_s) - 1
-            follows_log = self.uses_logged_flag & (last_row >= 0)
-            self.since_s[follows_log], self.until_s[follows_log] = self.logged_spans_s[
-                last_row[follows_log]
+            is_flag_from_log = self.uses_logged_flag & (last_row >= 0)
+            self.since_s[is_flag_from_log], self.until_s[is_flag_from_log] = self.logged_spans_s[
+                last_row[is_flag_from_log]
             ].T
         if not (self.until_s > begin_s).any():
             return np.zeros_like(self.until_s)

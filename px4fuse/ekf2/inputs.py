@@ -17,7 +17,7 @@ from px4fuse.ekf2.replay_segments import (
     MIN_SEGMENT_DURATION_S,
     ReplaySegment,
     add_flow_samples,
-    compute_internal_to_published_ratio,
+    compute_internal_to_published_position_ratio,
     find_replay_segments,
     read_prediction_step_s,
 )
@@ -59,7 +59,7 @@ SIMULATED_EKF2_NOTE = (
     "EKF2 in this log is px4fuse's model of EKF2, run on the simulated sensors, not PX4's EKF2"
 )
 # Logging interval (s) of the EKF2 topics that repeat the vision positions (logged_topics.cpp)
-VISION_REPETITION_INTERVALS_S = {
+LOGGING_INTERVAL_BY_VISION_TOPIC_S = {
     "estimator_visual_odometry_aligned": 0.2,
     "estimator_aid_src_ev_pos": 0.5,
 }
@@ -85,7 +85,7 @@ FIRST_RELEASE_WITH_HORIZON_TIMES = "PX4 v1.13"
 # Value of FusionRules.max_resets for an unlimited number of successive resets
 NO_RESET_LIMIT = 1_000_000
 # Maximum time (s) between two fusions of height and heading during a gap of the position source
-MAX_FUSION_INTERVAL_IN_GAP_S = 0.25
+MAX_HEIGHT_FUSION_INTERVAL_IN_POSITION_GAP_S = 0.25
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class FusionRules:
 
     Attributes
     ----------
-    start_interval_s : float
+    max_sample_interval_to_start_s : float
         EKF2 starts fusion if two samples arrive within this time.
     stop_timeout_s : float
         EKF2 stops fusion after this time without a sample.
@@ -142,7 +142,7 @@ class FusionRules:
         EKF2 stops fusion after this number of successive resets.
     min_accelerometer_bias_variance_m2_s4 : float or None
         Minimum accelerometer bias variance (m²/s⁴).
-    is_horizon_largest_delay : bool
+    is_horizon_set_by_largest_delay : bool
         True if the largest delay parameter sets the delay of the fusion horizon (before v1.15).
     reset_variance_factor : float
         Position variance after a reset, divided by the measurement variance.
@@ -152,12 +152,12 @@ class FusionRules:
         Time for which the flag for a bad acceleration stays set.
     """
 
-    start_interval_s: float
+    max_sample_interval_to_start_s: float
     stop_timeout_s: float
     reset_timeout_s: float
     max_resets: int
     min_accelerometer_bias_variance_m2_s4: float | None = None
-    is_horizon_largest_delay: bool = False
+    is_horizon_set_by_largest_delay: bool = False
     reset_variance_factor: float = 1.0
     resets_velocity: bool = False
     bad_acceleration_flag_duration_s: float = 3.0
@@ -166,11 +166,11 @@ class FusionRules:
 # Rules for external vision in PX4 v1.14 and later: EV_MAX_INTERVAL (ev_control.cpp),
 # no_aid_timeout_max and reset_timeout_max (common.h)
 VISION_RULES = FusionRules(
-    start_interval_s=0.2, stop_timeout_s=0.4, reset_timeout_s=1.0, max_resets=5
+    max_sample_interval_to_start_s=0.2, stop_timeout_s=0.4, reset_timeout_s=1.0, max_resets=5
 )
 # Rules for GNSS in PX4 v1.16 (resetHorizontalPositionTo, gps_control.cpp)
 GNSS_RULES = FusionRules(
-    start_interval_s=np.inf,
+    max_sample_interval_to_start_s=np.inf,
     stop_timeout_s=np.inf,
     reset_timeout_s=7.0,
     max_resets=NO_RESET_LIMIT,
@@ -197,9 +197,9 @@ class ReplayInputs:
         True if EKF2 fused the height of external vision.
     imu_offset_m : ndarray, shape (3,)
         Position of the IMU (EKF2_IMU_POS, body FRD).
-    max_fusion_interval_in_gap_s : float
+    max_height_fusion_interval_in_position_gap_s : float
         Maximum interval between fusions of height and heading in a gap of the position source.
-    reason_for_logged_height : str
+    reason_to_use_logged_height : str
         Reason why a replay with GNSS uses EKF2's logged height.
     vision_positions : ReceivedPositions or None
         Vision positions in a flight with GNSS; NaN while vision is disabled.
@@ -215,8 +215,10 @@ class ReplayInputs:
     fuses_vision_height: bool
     imu_offset_m: Array
     aid: Aid = EV_POS
-    max_fusion_interval_in_gap_s: float = MAX_FUSION_INTERVAL_IN_GAP_S
-    reason_for_logged_height: str = ""
+    max_height_fusion_interval_in_position_gap_s: float = (
+        MAX_HEIGHT_FUSION_INTERVAL_IN_POSITION_GAP_S
+    )
+    reason_to_use_logged_height: str = ""
     vision_positions: ReceivedPositions | None = None
 
 
@@ -310,15 +312,15 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if len(flow_samples):
         flow_gate = fusion_record.parameters.get(FLOW.gate, FLOW.default_gate)
         segments = tuple(add_flow_samples(segment, flow_samples, flow_gate) for segment in segments)
-    reason_for_logged_height = "; ".join(
+    reason_to_use_logged_height = "; ".join(
         f"{AIDS[name].label}: {reason}"
         for name, reason in omitted_aids.items()
         if name not in (FLOW.name, EV_POS.name)
     )
-    if is_gnss and not reason_for_logged_height:
+    if is_gnss and not reason_to_use_logged_height:
         segments_with_heights = add_heights(flight, ekf2, fusion_record, segments)
         if isinstance(segments_with_heights, str):
-            reason_for_logged_height = segments_with_heights
+            reason_to_use_logged_height = segments_with_heights
         else:
             segments = segments_with_heights
     other_aids = [EV_POS] if vision_positions else []
@@ -345,7 +347,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
             [fusion_record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]
         ),
         aid=aid,
-        reason_for_logged_height=reason_for_logged_height,
+        reason_to_use_logged_height=reason_to_use_logged_height,
         vision_positions=vision_positions,
     )
 
@@ -392,9 +394,9 @@ def _make_fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: b
     return replace(
         fusion_rules,
         min_accelerometer_bias_variance_m2_s4=5e-8 / step_s**2
-        if fusion_record.stores_bias_increments
+        if fusion_record.has_delta_angle_biases
         else None,
-        is_horizon_largest_delay="EKF2_DELAY_MAX" not in parameters,
+        is_horizon_set_by_largest_delay="EKF2_DELAY_MAX" not in parameters,
     )
 
 
@@ -461,7 +463,7 @@ def read_gnss(
         timestamp_s,
         timestamp_s,
         position_samples[Columns.POSITION].to_numpy()
-        * compute_internal_to_published_ratio(fusion_record),
+        * compute_internal_to_published_position_ratio(fusion_record),
         reported_variance.to_numpy(),
         *_read_logged_decisions(ekf2, fusion_record, timestamp_s, timestamp_s, GNSS_POS),
         track.name,
@@ -544,7 +546,9 @@ def _read_vision_in_gnss_flight(
     is_vision_disabled = (
         sample_step_function(enabled_changes, received_positions.timestamp_s) == 0.0
     )
-    position_m = received_positions.position_m * compute_internal_to_published_ratio(fusion_record)
+    position_m = received_positions.position_m * compute_internal_to_published_position_ratio(
+        fusion_record
+    )
     return replace(
         received_positions, position_m=np.where(is_vision_disabled[:, None], np.nan, position_m)
     )
@@ -666,10 +670,10 @@ def _find_vision_track(flight: Flight) -> PositionTrack | Unavailable:
     for track in sorted(flight.positions, key=lambda track: track.origin == POSITION_FILE_ORIGIN):
         if track.origin.is_vision and track.origin.has_all_samples:
             return track
-        if track.name in VISION_REPETITION_INTERVALS_S:
+        if track.name in LOGGING_INTERVAL_BY_VISION_TOPIC_S:
             median_interval_s = compute_median_interval_s(track.samples.index)
             if (
-                median_interval_s < 0.9 * VISION_REPETITION_INTERVALS_S[track.name]
+                median_interval_s < 0.9 * LOGGING_INTERVAL_BY_VISION_TOPIC_S[track.name]
                 and median_interval_s <= 0.25
             ):
                 return track

@@ -44,7 +44,7 @@ NO_ACTION, FUSE, START_FUSION = 0, 1, 2
 # initial attitude error (0 to 2), gyro bias (3 to 5) and accelerometer bias (6 to 8); then changes
 # due to the correction of the nominal attitude (9) and due to the measured acceleration (10)
 DERIVATIVE_COLUMN_COUNT = 11
-ATTITUDE_CORRECTION_DERIVATIVE_COLUMN, ACCELERATION_DERIVATIVE_COLUMN = 9, 10
+COLUMN_OF_DERIVATIVE_BY_ATTITUDE_CORRECTION, COLUMN_OF_DERIVATIVE_BY_ACCELERATION = 9, 10
 
 # One row per event: fusion of a position or, in a gap, of height and heading only
 StepEvents = np.recarray[Any, Any]
@@ -54,7 +54,7 @@ EVENT_DTYPE = np.dtype(
         ("sample", np.intp),  # index of the position sample, -1 without a sample
         ("action", np.intp),
         ("usable", bool),  # True if the sample arrived in time
-        ("can_start", bool),  # True if EKF2 may start fusion with this sample
+        ("can_start_fusion", bool),  # True if EKF2 may start fusion with this sample
         ("late", bool),  # True if the sample was fused late
         ("lost", bool),  # True if the sample arrived too late to be fused
         ("time_s", float),  # measurement time: timestamp - delay - half a prediction step
@@ -87,28 +87,28 @@ class EventIntervals:
         Returns
         -------
         transition : ndarray, shape (E, 15, 15)
-        state_change_by_correction, state_change_by_acceleration : ndarray, shape (E, 15)
+        state_change_by_attitude_correction, state_change_by_acceleration : ndarray, shape (E, 15)
             Change of the state in an interval by EKF2's attitude correction, and by acceleration.
         gyro_noise_covariance, accelerometer_noise_covariance : ndarray, shape (E, 9, 9)
             Process noise per prediction step, for 1 rad/s (gyroscope) or 1 m/s² (accelerometer).
         """
         state_derivatives, duration_s = self.state_derivatives[rows], self.duration_s[rows]
         transition = np.tile(np.eye(STATE_COUNT), (len(duration_s), 1, 1))
-        state_change_by_correction, state_change_by_acceleration = np.zeros(
+        state_change_by_attitude_correction, state_change_by_acceleration = np.zeros(
             (2, len(duration_s), STATE_COUNT)
         )
         transition[:, :MOTION_STATE_COUNT, THETA] = state_derivatives[..., :3]
         transition[:, :MOTION_STATE_COUNT, BIASES] = state_derivatives[..., 3:9]
-        state_change_by_correction[:, :MOTION_STATE_COUNT] = state_derivatives[
-            ..., ATTITUDE_CORRECTION_DERIVATIVE_COLUMN
+        state_change_by_attitude_correction[:, :MOTION_STATE_COUNT] = state_derivatives[
+            ..., COLUMN_OF_DERIVATIVE_BY_ATTITUDE_CORRECTION
         ]
         state_change_by_acceleration[:, :MOTION_STATE_COUNT] = state_derivatives[
-            ..., ACCELERATION_DERIVATIVE_COLUMN
+            ..., COLUMN_OF_DERIVATIVE_BY_ACCELERATION
         ]
         transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
         return (
             transition,
-            state_change_by_correction,
+            state_change_by_attitude_correction,
             state_change_by_acceleration,
             *_compute_imu_process_noise(
                 self.prediction_step_counts[rows], duration_s, transition[:, VELOCITY, THETA]
@@ -161,21 +161,21 @@ def _make_events(inputs: ReplayInputs, segment: ReplaySegment, delays: FusionDel
     earliest_fusion_times_s = np.maximum(
         measurement_times_s, received_positions.arrival_s[first_row:end_row] - delays.horizon_s
     )
-    sample_end_steps = np.searchsorted(time_s, earliest_fusion_times_s - 1e-9)
-    is_inside = (sample_end_steps > 0) & (sample_end_steps <= last_step)
-    sample_end_steps = np.maximum.accumulate(np.minimum(sample_end_steps, last_step))
-    is_in_time = time_s[sample_end_steps] < measurement_times_s + MAX_DELAY_BEHIND_HORIZON_S
+    fusion_step_by_sample = np.searchsorted(time_s, earliest_fusion_times_s - 1e-9)
+    is_inside = (fusion_step_by_sample > 0) & (fusion_step_by_sample <= last_step)
+    fusion_step_by_sample = np.maximum.accumulate(np.minimum(fusion_step_by_sample, last_step))
+    is_in_time = time_s[fusion_step_by_sample] < measurement_times_s + MAX_DELAY_BEHIND_HORIZON_S
     is_usable = is_inside & is_in_time
     # EKF2 fuses only the newer of two samples in one prediction step
-    is_usable[:-1] &= sample_end_steps[1:] > sample_end_steps[:-1]
-    action, can_start = _find_fusion_actions(
-        inputs, segment, measurement_times_s, sample_end_steps, is_usable
+    is_usable[:-1] &= fusion_step_by_sample[1:] > fusion_step_by_sample[:-1]
+    action, can_start_fusion = _find_fusion_actions(
+        inputs, segment, measurement_times_s, fusion_step_by_sample, is_usable
     )
     action[np.isin(timestamp_s, received_positions.reset_times_s) & (action == FUSE)] = START_FUSION
     # In a gap of the position source, height and heading are fused at regular intervals
     gap_s = np.diff(np.r_[time_s[0], timestamp_s, time_s[-1]])
     event_counts_in_gaps = np.maximum(
-        np.ceil(gap_s / inputs.max_fusion_interval_in_gap_s).astype(int) - 1, 0
+        np.ceil(gap_s / inputs.max_height_fusion_interval_in_position_gap_s).astype(int) - 1, 0
     )
     event_row_by_sample = np.cumsum(event_counts_in_gaps[:-1] + 1) - 1
     event_count = len(timestamp_s) + int(event_counts_in_gaps.sum())
@@ -184,7 +184,7 @@ def _make_events(inputs: ReplayInputs, segment: ReplaySegment, delays: FusionDel
         np.interp(
             np.arange(event_count),
             np.r_[-1, event_row_by_sample, event_count],
-            np.r_[0, sample_end_steps, last_step],
+            np.r_[0, fusion_step_by_sample, last_step],
         )
     )
     events["sample"], events["time_s"] = -1, time_s[events["end_step"]]
@@ -196,11 +196,11 @@ def _make_events(inputs: ReplayInputs, segment: ReplaySegment, delays: FusionDel
     is_too_late = is_inside & ~is_in_time
     events[event_row_by_sample] = np.rec.fromarrays(
         [
-            sample_end_steps,
+            fusion_step_by_sample,
             np.arange(first_row, end_row),
             action,
             is_usable,
-            can_start,
+            can_start_fusion,
             is_late,
             is_too_late,
             measurement_times_s,
@@ -223,11 +223,11 @@ def _find_fusion_actions(
     """
     fusion_rules = inputs.rules
     action = np.full(len(measurement_times_s), NO_ACTION)
-    can_start = np.zeros(len(measurement_times_s), dtype=bool)
+    can_start_fusion = np.zeros(len(measurement_times_s), dtype=bool)
     usable_rows = np.flatnonzero(is_usable)
     usable_times_s = measurement_times_s[usable_rows]
-    can_start[usable_rows] = (
-        np.diff(usable_times_s, prepend=-np.inf) < fusion_rules.start_interval_s
+    can_start_fusion[usable_rows] = (
+        np.diff(usable_times_s, prepend=-np.inf) < fusion_rules.max_sample_interval_to_start_s
     )
     # Time (s) since the previous usable sample
     sample_gaps_s = segment.time_s[end_steps[usable_rows] - 1] - np.append(
@@ -238,10 +238,10 @@ def _find_fusion_actions(
         is_fusing = is_fusing and not gap_s > fusion_rules.stop_timeout_s
         if is_fusing:
             action[row] = FUSE
-        elif can_start[row]:
+        elif can_start_fusion[row]:
             action[row] = START_FUSION
             is_fusing = True
-    return action, can_start
+    return action, can_start_fusion
 
 
 def _integrate_state_derivatives(
@@ -272,16 +272,16 @@ def _integrate_state_derivatives(
         dt = segment.step_s[step][:, None, None]
         force_m_s2 = specific_force_ned_m_s2[step]
         # Change of attitude per gyro bias, and of velocity per accelerometer bias, in one step
-        bias_derivative_of_step = -segment.body_to_ned[1:][step] * dt
+        state_derivative_by_bias_in_step = -segment.body_to_ned[1:][step] * dt
         position_derivatives[rows] += 0.5 * dt * velocity_derivatives[rows]
         velocity_derivatives[rows] += (-skew(force_m_s2) * dt) @ attitude_derivatives[rows]
-        velocity_derivatives[rows, :, 6:9] += bias_derivative_of_step
-        velocity_derivatives[rows, :, ACCELERATION_DERIVATIVE_COLUMN] += (
+        velocity_derivatives[rows, :, 6:9] += state_derivative_by_bias_in_step
+        velocity_derivatives[rows, :, COLUMN_OF_DERIVATIVE_BY_ACCELERATION] += (
             force_m_s2 + GRAVITY_M_S2
         ) * dt[:, :, 0]
         position_derivatives[rows] += 0.5 * dt * velocity_derivatives[rows]
-        attitude_derivatives[rows, :, 3:6] += bias_derivative_of_step
-        attitude_derivatives[rows, :, ATTITUDE_CORRECTION_DERIVATIVE_COLUMN] -= (
+        attitude_derivatives[rows, :, 3:6] += state_derivative_by_bias_in_step
+        attitude_derivatives[rows, :, COLUMN_OF_DERIVATIVE_BY_ATTITUDE_CORRECTION] -= (
             segment.attitude_correction_rad[step]
         )
     state_derivatives[:, longest_first_indices] = state_derivatives.copy()

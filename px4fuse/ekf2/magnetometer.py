@@ -46,12 +46,12 @@ def average_by_event(
     event_index = np.searchsorted(event_end_steps, sensor_samples.step_indices)
     # The last row contains the samples after the last event
     row_count = len(event_end_steps) + 1
-    rows_by_event = np.maximum(np.bincount(event_index, minlength=row_count), 1)
+    sample_count_by_event = np.maximum(np.bincount(event_index, minlength=row_count), 1)
 
     def mean(values: Array) -> Array:
         sum_by_event = np.zeros((row_count, *values.shape[1:]))
         np.add.at(sum_by_event, event_index, values)
-        return (sum_by_event.T / rows_by_event).T[:-1]
+        return (sum_by_event.T / sample_count_by_event).T[:-1]
 
     value, ned_to_body_rotation, noise_variance = map(
         mean, (sensor_samples.value, sensor_samples.ned_to_body_rotation, sensor_samples.noise)

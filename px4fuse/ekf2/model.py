@@ -143,9 +143,11 @@ def prepare_ekf2_model(
         > MAX_REJECTED_FRACTION_FOR_COMPARISON
         and np.isfinite(inputs.received_positions.rejected_flags).any()
     ):
-        agreement_with_rejections = compare_with_log(flight, replay_with_logged_rejections(model))
-        if isinstance(agreement_with_rejections, Agreement):
-            agreement = judge_with_logged_rejections(agreement, agreement_with_rejections)
+        agreement_with_logged_rejections = compare_with_log(
+            flight, replay_with_logged_rejections(model)
+        )
+        if isinstance(agreement_with_logged_rejections, Agreement):
+            agreement = judge_with_logged_rejections(agreement, agreement_with_logged_rejections)
     # This replay omits some aiding sources. Their agreement with the log is from the earlier replay
     # that fused them
     failed_agreement_by_field = {
@@ -195,7 +197,7 @@ def replay_with_settings(
     changes = [check_parameters(change) for change in settings]
     inputs = model.inputs
     reasons = {}
-    if inputs.rules.is_horizon_largest_delay:
+    if inputs.rules.is_horizon_set_by_largest_delay:
         reasons["EKF2_DELAY_MAX"] = (
             f"{model.flight.log.firmware} has no EKF2_DELAY_MAX: the largest sensor delay "
             "parameter sets the delay of the fusion horizon"
@@ -266,8 +268,8 @@ def _describe_modelled_aids(inputs: ReplayInputs) -> str:
     text = f"the replay of this log fuses only {', '.join(list_modelled_aids(inputs))}"
     if inputs.aid == GNSS_POS and MAG.noise not in inputs.settings:
         text += "; the log does not contain all magnetometer samples that EKF2 fused"
-    if inputs.reason_for_logged_height:
-        text += f"; the replay uses the logged EKF2 height ({inputs.reason_for_logged_height})"
+    if inputs.reason_to_use_logged_height:
+        text += f"; the replay uses the logged EKF2 height ({inputs.reason_to_use_logged_height})"
     return text
 
 
@@ -350,7 +352,9 @@ def _make_delayed_track(run: SegmentRun, configuration_index: int) -> pd.DataFra
 
 def _make_track(run: SegmentRun, velocity_m_s: Array, position_m: Array) -> pd.DataFrame:
     """Return a table of velocity (m/s) and position (m, in EKF2's published coordinates)."""
-    states = np.hstack([position_m / run.segment.internal_to_published_ratio, velocity_m_s])
+    states = np.hstack(
+        [position_m / run.segment.internal_to_published_position_ratio, velocity_m_s]
+    )
     return pd.DataFrame(states, time_index(run.segment.time_s), Columns.STATE, copy=False)
 
 
@@ -361,7 +365,7 @@ def _make_replay(
     changed_parameters: Mapping[str, float],
 ) -> Ekf2Replay:
     configuration_index = runs[0].configurations.index(configuration)
-    horizon_tracks, published_tracks = zip(
+    fusion_horizon_tracks, published_tracks = zip(
         *(_make_state_tracks(inputs, run, configuration_index) for run in runs), strict=True
     )
     aid_updates_of_runs = [
@@ -381,7 +385,7 @@ def _make_replay(
             if run.segment.flow is not None
             for span in _find_flow_only_spans(updates[inputs.aid.name], run.segment)
         ),
-        delayed_state=pd.concat(horizon_tracks),
+        delayed_state=pd.concat(fusion_horizon_tracks),
         published_state=pd.concat(published_tracks),
         other_aid_updates=updates_by_aid,
         stretches_s=tuple(tuple(run.segment.time_s[[0, -1]].tolist()) for run in runs),
@@ -404,7 +408,7 @@ def _collect_updates_by_aid(
     """Return the updates of one filter configuration, by PX4's name of the aiding source."""
     events, height_filter = run.events[configuration_index], run.height_filter
     end_s = run.segment.time_s[events.end_step]
-    nu, S, R, rejected, fused, reset, variance_after = (
+    nu, S, R, rejected, fused, reset, posterior_variance = (
         array[:, configuration_index]
         for array in (
             run.innovation,
@@ -423,7 +427,7 @@ def _collect_updates_by_aid(
         update_records = np.column_stack([nu[:, columns], S[:, columns], *other_values])
         return make_update_table(update_records[:, None], events.time_s[:, None], end_s, axes)
 
-    position_variance = variance_after[:, HORIZONTAL_POSITION]
+    position_variance = posterior_variance[:, HORIZONTAL_POSITION]
     updates_by_aid = {
         inputs.aid.name: make_axis_table(
             HORIZONTAL_AXES,
@@ -484,8 +488,8 @@ def _make_state_tracks(
     )
     # EKF2 publishes the position of the vehicle's origin, not of the IMU (output_predictor.cpp)
     published_position = published_position - segment.body_to_ned @ inputs.imu_offset_m
-    horizon_track = _make_track(run, state[:, VELOCITY], state[:, POSITION])
-    return horizon_track.assign(heading_rad=heading_rad), _make_track(
+    fusion_horizon_track = _make_track(run, state[:, VELOCITY], state[:, POSITION])
+    return fusion_horizon_track.assign(heading_rad=heading_rad), _make_track(
         run, published_velocity, published_position
     )
 

@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray, rms
 from px4fuse.core.record import (
-    NOT_WRITTEN,
+    NOT_IN_JSON,
     Correlation,
     Count,
+    NotInJson,
     NotNegative,
-    NotWritten,
     PositiveFloat,
     Record,
     Share,
@@ -59,7 +59,7 @@ MIN_INNOVATION_CORRELATION = 0.95
 # Maximum |median of (S replayed / S logged) - 1|: below 0.003 with complete logs
 MAX_INNOVATION_VARIANCE_RATIO_DEVIATION = 0.05
 # Maximum RMS difference (m) of replayed and logged position: below 0.013 m with complete logs
-MAX_PUBLISHED_DIFFERENCE_M = 0.10
+MAX_POSITION_DIFFERENCE_FROM_LOG_M = 0.10
 # Maximum position difference (m) between replay and log while EKF2 fuses only optical flow
 # horizontally
 MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
@@ -74,7 +74,7 @@ MIN_CORRELATION_IF_MOSTLY_REJECTED = 0.99
 MAX_REJECTED_FRACTION_DIFFERENCE = 0.05
 # Maximum relative difference of the mean NIS in replay and log
 MAX_RELATIVE_NIS_DIFFERENCE = 0.25
-# Factor on MAX_PUBLISHED_DIFFERENCE_M for flights with many rejections
+# Factor on MAX_POSITION_DIFFERENCE_FROM_LOG_M for flights with many rejections
 DIFFERENCE_FACTOR_WITH_MANY_REJECTIONS = 3.0
 
 
@@ -194,12 +194,12 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
     late: Count = 0
     lost: Count = 0
     agreement: Agreement | None = None
-    changed_parameters: NotWritten[Mapping[str, float]] = NOT_WRITTEN
-    updates: NotWritten[pd.DataFrame] = NOT_WRITTEN
-    delayed_state: NotWritten[pd.DataFrame] = NOT_WRITTEN
-    published_state: NotWritten[pd.DataFrame] = NOT_WRITTEN
-    other_aid_updates: NotWritten[Mapping[str, pd.DataFrame]] = NOT_WRITTEN
-    optical_flow_only_spans_s: NotWritten[Spans] = NOT_WRITTEN
+    changed_parameters: NotInJson[Mapping[str, float]] = NOT_IN_JSON
+    updates: NotInJson[pd.DataFrame] = NOT_IN_JSON
+    delayed_state: NotInJson[pd.DataFrame] = NOT_IN_JSON
+    published_state: NotInJson[pd.DataFrame] = NOT_IN_JSON
+    other_aid_updates: NotInJson[Mapping[str, pd.DataFrame]] = NOT_IN_JSON
+    optical_flow_only_spans_s: NotInJson[Spans] = NOT_IN_JSON
 
     def find_evaluated_spans(self) -> Spans:
         """Return the time spans (s) in which the replay is compared with the log.
@@ -340,7 +340,7 @@ def _subtract_logged_state(replay: Ekf2Replay, logged_state: pd.DataFrame) -> pd
 def _compute_heading_difference_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     if MAG.noise not in replay.settings or isinstance(ekf2.record, Unavailable):
         return None
-    logged_state = rows_inside(ekf2.record.delayed, replay.find_evaluated_spans())
+    logged_state = rows_inside(ekf2.record.delayed_state, replay.find_evaluated_spans())
     if logged_state.empty:
         return None
     replayed_heading_rad = replay.delayed_state["heading_rad"]
@@ -523,7 +523,7 @@ def _judge_agreement(
     )
     if min_correlation >= min_allowed_correlation:
         difference_m = max(axis.position_rms_difference_m for axis in axes.values())
-        max_difference_m = tolerance_factor * MAX_PUBLISHED_DIFFERENCE_M
+        max_difference_m = tolerance_factor * MAX_POSITION_DIFFERENCE_FROM_LOG_M
         if difference_m > max_difference_m:
             return False, (
                 "the innovations agree with the log, but replayed and logged positions differ by "
@@ -566,18 +566,20 @@ def _format_unlike_limit(value: float, limit: float) -> str:
 
 
 def judge_with_logged_rejections(
-    agreement: Agreement, agreement_with_rejections: Agreement
+    agreement: Agreement, agreement_with_logged_rejections: Agreement
 ) -> Agreement:
     """Return the agreement with the log for a flight with many rejections.
 
-    ``agreement_with_rejections`` is from a replay that rejects the same samples as EKF2.
+    ``agreement_with_logged_rejections`` is from a replay that rejects the same samples as EKF2.
     """
     rejected_fraction = agreement.rejected_fraction_logged
     is_mostly_rejected = rejected_fraction > MOSTLY_REJECTED_FRACTION
     limits = DIFFERENCE_FACTOR_WITH_MANY_REJECTIONS, MIN_INNOVATION_CORRELATION
     if is_mostly_rejected:
         limits = np.inf, MIN_CORRELATION_IF_MOSTLY_REJECTED
-    is_in_agreement, reason = _judge_agreement(agreement_with_rejections.axes, 0.0, 0.0, *limits)
+    is_in_agreement, reason = _judge_agreement(
+        agreement_with_logged_rejections.axes, 0.0, 0.0, *limits
+    )
     reason = f"in a replay that rejects the same samples as EKF2, {reason}"
     if is_mostly_rejected and not is_in_agreement:
         reason = (
@@ -585,7 +587,7 @@ def judge_with_logged_rejections(
             "IMU. The frame of the position source is probably wrong"
         )
     return replace(
-        agreement_with_rejections,
+        agreement_with_logged_rejections,
         rejected_fraction_replayed=agreement.rejected_fraction_replayed,
         decisions_same=agreement.decisions_same,
         good=is_in_agreement,

@@ -73,7 +73,7 @@ MAG_FUSION_HZ = 14.0
 # Minimum logging rate (Hz) of the magnetometer for a replay of its fusion
 MIN_MAG_LOG_HZ = 1.5
 # Time constant (s) of EKF2's low-pass filter of innovations (updateAidSourceStatus, ekf_helper.cpp)
-INNOVATION_TIME_CONSTANT_S = 0.5
+INNOVATION_LOW_PASS_TIME_CONSTANT_S = 0.5
 # Minimum length (s) of a replayed segment
 MIN_SEGMENT_DURATION_S = 10.0
 # Maximum delay (s) from a reset to its publication
@@ -189,7 +189,7 @@ class ReplaySegment:
         Logged flag for a bad vertical acceleration.
     mean_bias_down_m_s2 : float
         Mean vertical accelerometer bias.
-    internal_to_published_ratio : float or ndarray, shape (3,)
+    internal_to_published_position_ratio : float or ndarray, shape (3,)
         Ratio of EKF2's internal to its published position along each axis.
     preceding_segment : ReplaySegment or None
         Flight before the start, from which the correlations are estimated.
@@ -217,7 +217,7 @@ class ReplaySegment:
     is_acceleration_bad: BoolArray | None = None
     mean_bias_down_m_s2: float = 0.0
     flow: SensorSamples | None = None
-    internal_to_published_ratio: Array | float = 1.0
+    internal_to_published_position_ratio: Array | float = 1.0
     preceding_segment: "ReplaySegment | None" = None
     changed_parameters: Mapping[str, float] = record_field(default_factory=dict)
 
@@ -237,7 +237,7 @@ class ReplaySegment:
 def group_samples_by_event(
     segment: ReplaySegment,
     event_steps: IntArray,
-    measurement_steps: IntArray,
+    measurement_step_indices: IntArray,
     position_m: Array,
     axes: slice,
     *quantities: Array,
@@ -249,7 +249,7 @@ def group_samples_by_event(
     segment : ReplaySegment
     event_steps : ndarray of int, shape (events,)
         Prediction step of each event.
-    measurement_steps : ndarray of int, shape (m,)
+    measurement_step_indices : ndarray of int, shape (m,)
         Prediction step of each sample, increasing.
     position_m : ndarray, shape (m, a)
         Position along ``axes``.
@@ -264,18 +264,18 @@ def group_samples_by_event(
         Up to k samples per event. Rows: position propagated to the event with the IMU, age (s),
         further quantities, and 1 for a sample (0 for padding).
     """
-    event_indices = np.searchsorted(event_steps, measurement_steps)
+    event_indices = np.searchsorted(event_steps, measurement_step_indices)
     # Samples after the last event are not used
     sample_count = int(np.searchsorted(event_indices, len(event_steps)))
-    event_indices, measurement_steps = (
+    event_indices, measurement_step_indices = (
         event_indices[:sample_count],
-        measurement_steps[:sample_count],
+        measurement_step_indices[:sample_count],
     )
     event_step = event_steps[event_indices]
-    age_s = segment.time_s[event_step] - segment.time_s[measurement_steps]
+    age_s = segment.time_s[event_step] - segment.time_s[measurement_step_indices]
     displacement_m = (
         segment.imu_displacement_m[event_step]
-        - segment.imu_displacement_m[measurement_steps]
+        - segment.imu_displacement_m[measurement_step_indices]
         - segment.imu_velocity_change_m_s[event_step] * age_s[:, None]
     )
     index_in_event = np.arange(sample_count) - np.searchsorted(event_indices, event_indices)
@@ -347,7 +347,7 @@ def find_replay_segments(
     """Find the parts of a flight without gaps in IMU and positions, after EKF2's first fusion."""
     innovations = ekf2.innovations["north"]
     assert isinstance(innovations, pd.DataFrame)
-    state_times_s = fusion_record.delayed.index.to_numpy()
+    state_times_s = fusion_record.delayed_state.index.to_numpy()
     imu_times_s = imu.index.to_numpy()
     # The replay restarts when another EKF2 instance with another state becomes primary
     boundary_times_s = [imu_times_s[0], imu_times_s[-1]]
@@ -424,9 +424,11 @@ def _add_gnss_model_inputs(
     segment: ReplaySegment, imu: pd.DataFrame, ekf2: Ekf2, fusion_record: FusionRecord
 ) -> ReplaySegment:
     """Add the inputs that only the GNSS model uses, such as earth rotation and clipping."""
-    internal_to_published_ratio = compute_internal_to_published_ratio(fusion_record)
+    internal_to_published_position_ratio = compute_internal_to_published_position_ratio(
+        fusion_record
+    )
     initial_state = segment.state.copy()
-    initial_state[POSITION] *= internal_to_published_ratio
+    initial_state[POSITION] *= internal_to_published_position_ratio
     earth_rotation_rad = compute_earth_rate_rad_s(fusion_record) * segment.step_s[:, None]
     start_s, end_s = span_s = segment.time_s[[0, -1]]
     velocity_change_m_s = np.diff(np.interp(span_s, ekf2.state.index, ekf2.state["down_m_s"]))[0]
@@ -434,7 +436,7 @@ def _add_gnss_model_inputs(
     return replace(
         segment,
         state=initial_state,
-        internal_to_published_ratio=internal_to_published_ratio,
+        internal_to_published_position_ratio=internal_to_published_position_ratio,
         attitude_correction_rad=segment.attitude_correction_rad + earth_rotation_rad,
         clipped_fraction=_compute_clipped_fraction(imu, segment.time_s),
         mean_bias_down_m_s2=float(velocity_change_error_m_s / (end_s - start_s)),
@@ -449,7 +451,7 @@ def compute_earth_rate_rad_s(fusion_record: FusionRecord) -> Array:
     )
 
 
-def compute_internal_to_published_ratio(fusion_record: FusionRecord) -> Array | float:
+def compute_internal_to_published_position_ratio(fusion_record: FusionRecord) -> Array | float:
     """Return the ratio of EKF2's internal to its published position along north, east and down.
 
     Since PX4 v1.16, EKF2 computes positions on an ellipsoid, but publishes positions on a sphere.
@@ -513,16 +515,18 @@ def _make_segment(
     start_row: int,
     end_s: float,
 ) -> ReplaySegment:
-    initial_row = fusion_record.delayed.iloc[start_row].astype(np.float64)
+    initial_row = fusion_record.delayed_state.iloc[start_row].astype(np.float64)
     imu_times_s = imu.index.to_numpy()
-    first_row = int(np.argmin(np.abs(imu_times_s - fusion_record.delayed.index[start_row])))
+    first_row = int(np.argmin(np.abs(imu_times_s - fusion_record.delayed_state.index[start_row])))
     segment_rows = slice(first_row, int(np.searchsorted(imu_times_s, end_s, side="right")))
     imu_times_s = imu_times_s[segment_rows]
     imu = imu.iloc[segment_rows]
     imu_intervals_s = np.diff(imu_times_s)
-    logged_end_indices = find_rows_of_timestamps(imu_times_s, fusion_record.delayed.index)
+    logged_step_end_indices = find_rows_of_timestamps(
+        imu_times_s, fusion_record.delayed_state.index
+    )
     step_end_indices = find_step_ends(
-        imu_intervals_s, logged_end_indices, read_prediction_step_s(fusion_record)
+        imu_intervals_s, logged_step_end_indices, read_prediction_step_s(fusion_record)
     )
     accelerometer_bias = np.asarray(initial_row[Columns.ACCELEROMETER_BIAS])
     gyro_bias = np.asarray(initial_row[Columns.GYRO_BIAS])
@@ -556,7 +560,7 @@ def _make_segment(
     )
     nominal_attitude = multiply(rotation_to_published_attitude, gyro_attitude)
     state_times_s, error_quaternions = compute_relative_attitude(
-        fusion_record.delayed, 1e-4, nominal_attitude
+        fusion_record.delayed_state, 1e-4, nominal_attitude
     )
     attitude_error_rad = to_rotation_vector(error_quaternions)
     published_position_m = _interpolate(ekf2.state[Columns.POSITION], step_times_s[:1])[0]
@@ -582,9 +586,9 @@ def _make_segment(
         variance=np.asarray(initial_row[Columns.FUSION_HORIZON_VARIANCE[:15]]),
         down_m=_interpolate(ekf2.state[["down_m"]], step_times_s)[:, 0],
         attitude_variance_rad2=_interpolate(
-            fusion_record.delayed[Columns.FUSION_HORIZON_VARIANCE[:3]], step_times_s
+            fusion_record.delayed_state[Columns.FUSION_HORIZON_VARIANCE[:3]], step_times_s
         ).astype(np.float32),
-        down_variance_m2=_interpolate(fusion_record.delayed[["down_m2"]], step_times_s)[:, 0],
+        down_variance_m2=_interpolate(fusion_record.delayed_state[["down_m2"]], step_times_s)[:, 0],
         attitude_error_rad=_interpolate(
             pd.DataFrame(attitude_error_rad, state_times_s), step_times_s
         ).astype(np.float32),
@@ -619,13 +623,13 @@ def _find_magnetometer_3d_fusion_span(fusion_record: FusionRecord) -> Span:
 def _add_magnetic_field(
     segment: ReplaySegment, fusion_record: FusionRecord, start_row: int, step_s: float
 ) -> ReplaySegment:
-    initial_row = fusion_record.delayed.iloc[start_row]
+    initial_row = fusion_record.delayed_state.iloc[start_row]
     field_gauss = fusion_record.magnetic_field_gauss
     sample_times_s = field_gauss.index.to_numpy()
     age_s = fusion_record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     fused_samples_per_row = max(MAG_FUSION_HZ * compute_median_interval_s(sample_times_s), 1.0)
     measurement_times_s = sample_times_s - age_s
-    segment_with_fields = add_field_states(
+    segment_with_magnetic_field_states = add_field_states(
         segment,
         measurement_times_s,
         field_gauss.iloc[:, :3].to_numpy(),
@@ -634,12 +638,12 @@ def _add_magnetic_field(
         np.asarray(initial_row[Columns.FUSION_HORIZON_VARIANCE[-6:]]),
     )
     if Columns.MAGNETIC_FIELD_INNOVATION[0] not in field_gauss:
-        return segment_with_fields
+        return segment_with_magnetic_field_states
     return replace(
-        segment_with_fields,
+        segment_with_magnetic_field_states,
         magnetic_field=_compute_mean_magnetic_field(
             segment,
-            fusion_record.delayed,
+            fusion_record.delayed_state,
             measurement_times_s,
             field_gauss[Columns.MAGNETIC_FIELD_INNOVATION].to_numpy(),
         ),
@@ -668,7 +672,7 @@ def _compute_mean_magnetic_field(
     row_interval_s = row_interval_s[gap_free_rows - 1]
     fused_sample_counts = np.maximum(np.rint(MAG_FUSION_HZ * row_interval_s), 1.0)
     new_sample_weight = row_interval_s / (
-        row_interval_s + fused_sample_counts * INNOVATION_TIME_CONSTANT_S
+        row_interval_s + fused_sample_counts * INNOVATION_LOW_PASS_TIME_CONSTANT_S
     )
     previous_innovation_weight = ((1.0 - new_sample_weight) ** fused_sample_counts)[:, None]
     nu_gauss = (
@@ -822,7 +826,7 @@ def _interpolate(table: pd.DataFrame, times_s: Array) -> Array:
 
 
 def find_step_ends(
-    interval_s: Array, logged_end_indices: IntArray, configured_step_s: float
+    interval_s: Array, logged_step_end_indices: IntArray, configured_step_s: float
 ) -> IntArray:
     """Return the index of the IMU sample at the end of each prediction step of EKF2."""
     median_interval_s = float(np.median(interval_s))
@@ -830,11 +834,11 @@ def find_step_ends(
     sample_counts = np.maximum(np.rint(interval_s / median_interval_s), 1.0)
     if sample_counts.mean() <= 1.0 + MAX_LOST_IMU_FRACTION:
         sample_counts[:] = 1.0
-    sample_counts_at_logged_ends = np.append(0.0, np.cumsum(sample_counts))[logged_end_indices]
+    sample_counts_at_logged_ends = np.append(0.0, np.cumsum(sample_counts))[logged_step_end_indices]
     samples_per_step = compute_samples_per_step(
         configured_step_s, median_interval_s, sample_counts_at_logged_ends
     )
-    logged_end_index_set = set(logged_end_indices.tolist())
+    logged_step_end_index_set = set(logged_step_end_indices.tolist())
     end_indices = []
     accumulated_count = accumulated_time_s = 0.0
     for sample, (interval, sample_count) in enumerate(
@@ -845,7 +849,7 @@ def find_step_ends(
         if (
             (accumulated_count >= samples_per_step and accumulated_time_s > 0.5 * configured_step_s)
             or accumulated_time_s > configured_step_s
-            or sample in logged_end_index_set
+            or sample in logged_step_end_index_set
         ):
             end_indices.append(sample)
             accumulated_count = accumulated_time_s = 0.0

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array
-from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Record, Span
+from px4fuse.core.record import NOT_IN_JSON, Count, NotInJson, NotNegative, Record, Span
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import (
@@ -145,9 +145,9 @@ class DifferenceExplanation(Record, kw_only=True):
     outside: DifferenceOutsideReplay | None = None
     corrected: Mapping[str, float] = {}
     sentences: tuple[str, ...] = ()
-    times_s: NotWritten[Array] = NOT_WRITTEN
-    kf_minus_ekf2_m: NotWritten[Array] = NOT_WRITTEN
-    unexplained_difference_m: NotWritten[Array] = NOT_WRITTEN
+    times_s: NotInJson[Array] = NOT_IN_JSON
+    kf_minus_ekf2_m: NotInJson[Array] = NOT_IN_JSON
+    unexplained_difference_m: NotInJson[Array] = NOT_IN_JSON
 
     @property
     def unexplained_fraction(self) -> float:
@@ -173,7 +173,7 @@ def explain_difference_by_replacements(
     assert isinstance(ekf2, Ekf2)
     configurations = make_replacement_configurations(model.inputs, settings)
     # The last configuration is not run here: baseline_replay contains its track
-    horizon_tracks = compute_delayed_tracks(model, [*configurations.values()][:-1])
+    fusion_horizon_tracks = compute_delayed_tracks(model, [*configurations.values()][:-1])
     baseline_replay = replay_with_logged_rejections(model)
     evaluated_spans = model.baseline_replay.find_evaluated_spans()
     state_times_s = ekf2.state.index.to_numpy()
@@ -193,14 +193,14 @@ def explain_difference_by_replacements(
         )
     state_span_s = float(state_times_s[0]), float(state_times_s[-1])
     property_names = (*configurations, OUTPUT_PREDICTOR_PROPERTY)
-    components_by_track = []
+    states_by_track = []
     # Tracks are computed one at a time, to limit the memory
     tracks = chain(
-        horizon_tracks,
+        fusion_horizon_tracks,
         (baseline_replay.delayed_state, baseline_replay.published_state, ekf2.state),
     )
     for property_name, track in zip((*property_names, "EKF2 as logged"), tracks, strict=True):
-        components_by_track.append(
+        states_by_track.append(
             [
                 [
                     interpolate_component(track, columns, run.axis.direction, state_times_s)
@@ -219,7 +219,7 @@ def explain_difference_by_replacements(
     )
     explanations = {}
     for (axis, kf_run), axis_components in zip(
-        kf_runs.items(), np.swapaxes(components_by_track, 0, 1), strict=True
+        kf_runs.items(), np.swapaxes(states_by_track, 0, 1), strict=True
     ):
         kf_state = predict_track(kf_run, state_times_s)[STATE_COLUMNS].to_numpy().T
         explanations[axis] = _explain_difference_along_axis(
@@ -239,22 +239,21 @@ def _explain_difference_along_axis(
     direction: Array,
     property_names: Sequence[str],
     times_s: Array,
-    components_by_track: Array,
+    states_by_track: Array,
     spans_s: Spans,
     longest_rejection: RejectionRun | None,
 ) -> DifferenceExplanation:
     """Divide the mean square difference KF - EKF2 along one axis among k replaced properties.
 
-    ``components_by_track``, shape (k + 2, 2, n), contains position and velocity at n times. The
+    ``states_by_track``, shape (k + 2, 2, n), contains position and velocity at n times. The
     first track is KF, the last track is the logged EKF2.
     """
-    differences_by_track = components_by_track - components_by_track[-1]
+    differences_by_track = states_by_track - states_by_track[-1]
     rmse_by_track = [
-        compute_rmse_to_truth(flight, track, direction, times_s)
-        for track in components_by_track[:, 0]
+        compute_rmse_to_truth(flight, track, direction, times_s) for track in states_by_track[:, 0]
     ]
     mean_square_differences = np.mean(differences_by_track[:-1] ** 2, axis=2)
-    position_change = np.abs(np.diff(components_by_track[:-1, 0], axis=0))
+    position_change = np.abs(np.diff(states_by_track[:-1, 0], axis=0))
     steps = tuple(
         PropertyReplacement(
             name=name,
@@ -306,19 +305,19 @@ def make_replacement_configurations(
     acceleration_noise_m_s2 = kf_settings.sigma_a_m_s2 * math.sqrt(
         kf_settings.dt_s / inputs.mean_step_s
     )
-    kf_process_settings = {**logged_settings, "EKF2_ACC_NOISE": acceleration_noise_m_s2}
-    kf_noise_settings = {**kf_process_settings, aid.noise: kf_settings.sigma_z_m}
+    settings_with_kf_process_noise = {**logged_settings, "EKF2_ACC_NOISE": acceleration_noise_m_s2}
+    settings_with_kf_noises = {**settings_with_kf_process_noise, aid.noise: kf_settings.sigma_z_m}
     # The delay is already subtracted from KF's GNSS times, but not from the replay's timestamps
     applied_delay_s = logged_settings[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
     time_offset_s = kf_settings.clock_offset_s - applied_delay_s
-    settings_without_lever_arm = {**kf_noise_settings, **dict.fromkeys(aid.lever_arm, 0.0)}
+    settings_without_lever_arm = {**settings_with_kf_noises, **dict.fromkeys(aid.lever_arm, 0.0)}
     replayed_aids = list_modelled_aids(inputs)[1:]
     property_by_aid = {
         aid: name for aid, name in PROPERTY_BY_ADDITIONAL_AID.items() if aid in replayed_aids
     }
     additional_aids = [*property_by_aid]
     kf_configuration = FilterConfiguration(
-        kf_noise_settings,
+        settings_with_kf_noises,
         estimates_biases=False,
         estimates_attitude=False,
         uses_reported_noise=False,
@@ -327,7 +326,7 @@ def make_replacement_configurations(
         disable_time_s_by_aid=dict.fromkeys((MAG.name, *additional_aids), 0.0),
     )
     measurement_noise_configuration = replace(
-        kf_configuration, settings=kf_process_settings, uses_reported_noise=True
+        kf_configuration, settings=settings_with_kf_process_noise, uses_reported_noise=True
     )
     process_noise_configuration = replace(
         measurement_noise_configuration, settings=logged_settings, estimates_biases=True
@@ -364,7 +363,7 @@ def make_replacement_configurations(
 
 def _find_longest_rejection(
     baseline_replay: Ekf2Replay,
-    horizon_track_without_gate: pd.DataFrame,
+    fusion_horizon_track_without_gate: pd.DataFrame,
     span: Span,
     spans_s: Spans,
 ) -> RejectionRun | None:
@@ -380,13 +379,13 @@ def _find_longest_rejection(
     longest_index = int(np.argmax(run_ends - run_starts))
     begin_s = fusion_times_s[run_starts[longest_index]]
     end_s = fusion_times_s[min(run_ends[longest_index], len(fusion_times_s) - 1)]
-    horizon_track = baseline_replay.delayed_state.loc[begin_s:end_s]
+    fusion_horizon_track = baseline_replay.delayed_state.loc[begin_s:end_s]
     position_difference = [
-        horizon_track[column]
+        fusion_horizon_track[column]
         - np.interp(
-            horizon_track.index,
-            horizon_track_without_gate.index,
-            horizon_track_without_gate[column],
+            fusion_horizon_track.index,
+            fusion_horizon_track_without_gate.index,
+            fusion_horizon_track_without_gate[column],
         )
         for column in Columns.POSITION[:2]
     ]

@@ -153,11 +153,11 @@ class VisionFilter:
         )
 
     def fuse(
-        self, event: int, x: Array, P: Array, is_last_step: bool, last_gnss_fusion_s: Array
+        self, event: int, x: Array, P: Array, is_after_gnss_fusion: bool, last_gnss_fusion_s: Array
     ) -> ArrayPair:
         """Fuse the vision samples of one event; return x and P.
 
-        ``is_last_step`` is True for the samples that EKF2 fuses after GNSS.
+        ``is_after_gnss_fusion`` is True for the samples that EKF2 fuses after GNSS.
 
         A restart of the fusion resets the position or, with GNSS, the vision bias to the sample.
         EKF2 restarts the fusion after a gap of vision, a change of GNSS fusion, and too many
@@ -167,7 +167,7 @@ class VisionFilter:
         """
         is_gnss_off = self.is_gnss_off[event]
         # Fuse the first sample of each configuration in this event, then the second, and so on
-        for sample_index, has_sample in enumerate(self.has_sample[is_last_step][:, event]):
+        for sample_index, has_sample in enumerate(self.has_sample[is_after_gnss_fusion][:, event]):
             if not has_sample.any():
                 continue
             age_s, fusion_time_s, R_m2 = (

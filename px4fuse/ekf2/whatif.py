@@ -80,11 +80,11 @@ MAX_REJECTED_FRACTION = 0.35
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
 # Maximum ratio of largest to smallest mean NIS of replays with different added noise
-MAX_NIS_RATIO_OF_NOISY_REPLAYS = 1.10
+MAX_NIS_RATIO_BETWEEN_REPEATED_REPLAYS = 1.10
 # Maximum difference between the rejected fractions of replays with different added noise
-MAX_REJECTED_SPREAD_OF_NOISY_REPLAYS = 0.03
+MAX_REJECTED_FRACTION_RANGE_OF_REPLAYS = 0.03
 # Maximum ratio of largest to smallest position RMSE of replays with different added noise
-MAX_RMSE_RATIO_OF_NOISY_REPLAYS = 1.15
+MAX_RMSE_RATIO_BETWEEN_REPEATED_REPLAYS = 1.15
 
 
 class AxisStatistics(Record):
@@ -246,7 +246,7 @@ def what_if(
     if settings and model.inputs.aid == GNSS_POS:
         if model.agreement.heading_rms_difference_deg is None:
             notes.append(HEADING_LOGGED_NOTE)
-        if model.inputs.reason_for_logged_height:
+        if model.inputs.reason_to_use_logged_height:
             notes.append(HEIGHT_LOGGED_NOTE)
     for replay in replays:
         summaries.append(_summarise_replay(flight, replay, spans_s))
@@ -347,12 +347,15 @@ def _results_agree(summaries: Sequence[Ekf2Statistics]) -> bool:
     rejected_fractions = [summary.rejected_fraction for summary in summaries]
     rmses_m = [summary.position_rmse_to_truth_m for summary in summaries]
     values_and_max_ratios = [
-        ([summary.axes[axis].nis_mean for summary in summaries], MAX_NIS_RATIO_OF_NOISY_REPLAYS)
+        (
+            [summary.axes[axis].nis_mean for summary in summaries],
+            MAX_NIS_RATIO_BETWEEN_REPEATED_REPLAYS,
+        )
         for axis in HORIZONTAL_AXES
     ]
     known_rmses_m = [rmse_m for rmse_m in rmses_m if isinstance(rmse_m, float)]
-    values_and_max_ratios.append((known_rmses_m or [0.0], MAX_RMSE_RATIO_OF_NOISY_REPLAYS))
-    return np.ptp(rejected_fractions) <= MAX_REJECTED_SPREAD_OF_NOISY_REPLAYS and all(
+    values_and_max_ratios.append((known_rmses_m or [0.0], MAX_RMSE_RATIO_BETWEEN_REPEATED_REPLAYS))
+    return np.ptp(rejected_fractions) <= MAX_REJECTED_FRACTION_RANGE_OF_REPLAYS and all(
         max(values) <= max_ratio * min(values) for values, max_ratio in values_and_max_ratios
     )
 
@@ -560,8 +563,8 @@ def _describe_deviation(
         - model.baseline_replay.published_state[Columns.POSITION],
         spans_s,
     )
-    *horizontal_m, height_difference_m = np.abs(position_difference_m.to_numpy()).T
-    horizontal_distance_m = np.hypot(*horizontal_m)
+    *horizontal_differences_m, height_difference_m = np.abs(position_difference_m.to_numpy()).T
+    horizontal_distance_m = np.hypot(*horizontal_differences_m)
     aids_text = ", ".join(
         f"{aid} from {from_s:g} s on" for aid, from_s in disable_time_s_by_aid.items()
     )
@@ -592,9 +595,9 @@ def _describe_replay_limits(model: Ekf2Model, replay: Ekf2Replay) -> Iterator[st
         )
     # If the largest delay parameter sets the fusion horizon (before PX4 v1.15), the parameter
     # EKF2_DELAY_MAX does not exist
-    is_horizon_largest_delay = model.inputs.rules.is_horizon_largest_delay
+    is_horizon_set_by_largest_delay = model.inputs.rules.is_horizon_set_by_largest_delay
     delay_ms = max(replay.changed_parameters.get(aid.delay, 0.0) for aid in (EV_POS, GNSS_POS))
-    if not is_horizon_largest_delay and delay_ms > (
+    if not is_horizon_set_by_largest_delay and delay_ms > (
         delay_max_ms := replay.settings["EKF2_DELAY_MAX"]
     ):
         yield (
@@ -612,7 +615,7 @@ def _describe_replay_limits(model: Ekf2Model, replay: Ekf2Replay) -> Iterator[st
             "would arrive late, after the fusion horizon. EKF2 would never fuse "
             f"{replay.lost} of them"
         )
-        yield note if is_horizon_largest_delay else f"{note}. Increase EKF2_DELAY_MAX"
+        yield note if is_horizon_set_by_largest_delay else f"{note}. Increase EKF2_DELAY_MAX"
 
 
 def _format_changes(replay: Ekf2Replay) -> str:

@@ -37,9 +37,9 @@ PageData = dict[str, Any]
 # Half the range (s) of the slider for the time offset
 OFFSET_SLIDER_HALF_RANGE_S = 0.6
 # Rounding steps per unit (m, m/s or s) for the inputs of KF; integers compress well
-KF_INPUT_STEPS_PER_UNIT = 2.0**36
+KF_INPUT_ROUNDING_STEPS_PER_UNIT = 2.0**36
 # Rounding steps per unit for values that are only drawn or averaged
-DRAWN_VALUE_STEPS_PER_UNIT = 1e6
+DRAWN_VALUE_ROUNDING_STEPS_PER_UNIT = 1e6
 # Limit of the rounded values: JavaScript represents integers exactly up to twice this limit
 MAX_EXACT_INTEGER = 2.0**52
 
@@ -50,7 +50,7 @@ class ArrayEncoder:
 
     _encoded_arrays: list[tuple[float, list[int]]] = field(default_factory=list)
 
-    def add(self, values: Array, scale: float = KF_INPUT_STEPS_PER_UNIT) -> dict[str, int]:
+    def add(self, values: Array, scale: float = KF_INPUT_ROUNDING_STEPS_PER_UNIT) -> dict[str, int]:
         """Add an array, rounded to ``scale`` steps per unit.
 
         Return ``{"array": index}``, which replaces the array in the JSON data.
@@ -65,7 +65,7 @@ class ArrayEncoder:
 
     def add_times(self, time_s: Array) -> dict[str, int]:
         has_whole_microseconds = bool(np.all(np.abs(np.rint(time_s * 1e6) / 1e6 - time_s) < 1e-10))
-        return self.add(time_s, 1e6 if has_whole_microseconds else KF_INPUT_STEPS_PER_UNIT)
+        return self.add(time_s, 1e6 if has_whole_microseconds else KF_INPUT_ROUNDING_STEPS_PER_UNIT)
 
     def text(self) -> str:
         """Return all arrays as one base64 text of compressed JSON."""
@@ -176,7 +176,10 @@ def _pack_nis_bands(innovation_count: int, encoder: ArrayEncoder) -> list[dict[s
     """
     innovation_counts = np.arange(1, 2 * innovation_count + 1)
     bounds = stats.chi2.interval(CONFIDENCE_LEVEL, innovation_counts)
-    return [encoder.add(bound / innovation_counts, DRAWN_VALUE_STEPS_PER_UNIT) for bound in bounds]
+    return [
+        encoder.add(bound / innovation_counts, DRAWN_VALUE_ROUNDING_STEPS_PER_UNIT)
+        for bound in bounds
+    ]
 
 
 def _make_ekf2_data(result: AxisComparison, encoder: ArrayEncoder) -> PageData | None:
@@ -232,7 +235,9 @@ def _pack_series(
     time_s: ArrayLike, columns: Iterable[ArrayLike], encoder: ArrayEncoder
 ) -> list[dict[str, int]]:
     """Encode times and columns that the page only draws or averages."""
-    values = [encoder.add(np.asarray(column), DRAWN_VALUE_STEPS_PER_UNIT) for column in columns]
+    values = [
+        encoder.add(np.asarray(column), DRAWN_VALUE_ROUNDING_STEPS_PER_UNIT) for column in columns
+    ]
     return [encoder.add_times(np.asarray(time_s)), *values]
 
 
@@ -262,7 +267,7 @@ def _make_command(request: ComparisonRequest, analysis: Analysis) -> str:
     heading_deg = request.heading_deg
     if heading_deg is None and AISLE in analysis.axes:
         heading_deg = analysis[AISLE].heading_deg
-    fixed_request = msgspec.structs.replace(
+    request_without_kf_settings = msgspec.structs.replace(
         request,
         sigma_a_m_s2=SIGMA_A_M_S2,
         sigma_z_m=None,
@@ -273,4 +278,4 @@ def _make_command(request: ComparisonRequest, analysis: Analysis) -> str:
         end_s=analysis.segment.end_s,
         heading_deg=heading_deg,
     )
-    return command_line(fixed_request, for_shell=True)
+    return command_line(request_without_kf_settings, for_shell=True)

@@ -31,13 +31,13 @@ ASSET_PACKAGE = "px4fuse.explore"
 def make_analysis_page(analysis: Analysis) -> str:
     encoder = ArrayEncoder()
     data, card = make_flight_data(analysis, encoder), make_diagnosis_card(analysis)
-    identity = card.identity
+    description = card.identity
     return make_page_html(
         data,
         data_scripts=make_data_elements(data, analysis, encoder),
         command="explore",
         title=data["log"],
-        about=f"{identity.source}, {identity.firmware}, {identity.duration_s:.1f} s",
+        about=f"{description.source}, {description.firmware}, {description.duration_s:.1f} s",
         card=make_card_html(card, has_apply_buttons=True),
         sha256=analysis.flight.log.sha256,
     )

@@ -48,7 +48,7 @@ COARSE_CORRELATED_VARIANCE_FRACTIONS = (0.12, 0.35, 0.8)
 COARSE_SIGMA_A_FACTORS = (0.4, 0.9)
 # Tested factors on all σ in the coarse search
 COARSE_SIGMA_FACTORS = np.geomspace(0.7, 1.6, 12)
-COARSE_MEASUREMENT_COUNT = 1000
+COARSE_SEARCH_MEASUREMENT_COUNT = 1000
 # Minimum log-likelihood gain over white noise in the coarse search; below it, no full fit is made
 MIN_GAIN_FOR_FULL_FIT_NATS = 0.5
 # Below this estimate of SIGMA_Z (m), the source probably low-pass filters its positions
@@ -215,7 +215,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         return imu_motion
     tested_offsets_s = sorted({0.0, clock_offset_s})
     sigma_z_m = noise_parameters.sigma_z_m
-    downsampled_motion = imu_motion.downsample(COARSE_MEASUREMENT_COUNT)
+    downsampled_motion = imu_motion.downsample(COARSE_SEARCH_MEASUREMENT_COUNT)
     # Default result: no low-pass filter
     source_low_pass = SourceLowPass(0.0, 0.0, 0.0, sigma_z_m)
     correlated_candidates = [
@@ -228,7 +228,10 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         for fraction, tau in product(COARSE_CORRELATED_VARIANCE_FRACTIONS, COARSE_TAUS_S)
     ]
     # Scores are -ln p of the positions, so the lowest score is the best
-    (coarse_white_noise_score, _), (coarse_correlated_noise_score, correlated_start_parameters) = (
+    (
+        (coarse_white_noise_score, _),
+        (coarse_correlated_noise_score, correlated_noise_start_parameters),
+    ) = (
         _search_coarse_grid(downsampled_motion, tested_offsets_s, candidate_parameters)
         for candidate_parameters in ([noise_parameters], correlated_candidates)
     )
@@ -249,7 +252,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
             ),
             key=lambda fit_and_offset: fit_and_offset[0].compute_score(),
         )
-        for start_parameters in (noise_parameters, correlated_start_parameters)
+        for start_parameters in (noise_parameters, correlated_noise_start_parameters)
     )
     white_noise_score = white_noise_fit.compute_score()
     correlated_noise_score = correlated_noise_fit.compute_score()

@@ -100,7 +100,7 @@ class NegativeLogLikelihood:
 
     Parameters
     ----------
-    axis_positions : sequence of PositionsAndIncrements
+    positions_by_axis : sequence of PositionsAndIncrements
         Positions along each axis.
     measurement_weights : ndarray, shape (m,)
         The variance of a measurement is SIGMA_Z² / weight.
@@ -110,43 +110,47 @@ class NegativeLogLikelihood:
 
     def __init__(
         self,
-        axis_positions: Sequence[PositionsAndIncrements],
+        positions_by_axis: Sequence[PositionsAndIncrements],
         measurement_weights: Array,
         sigma_z_m: float,
     ) -> None:
-        self.axis_positions = axis_positions
+        self.positions_by_axis = positions_by_axis
         self.measurement_weights = measurement_weights
         self.sigma_z_m = sigma_z_m
         self.is_interpolated = not any(
-            positions.process_noise_independent_of_sigma_a.any() for positions in axis_positions
+            positions.process_noise_independent_of_sigma_a.any() for positions in positions_by_axis
         )
 
         @cache
-        def fit_axes_with_sigma_ratio(log_sigma_ratio_node: int) -> list[PositionFit]:
-            sigma_a_to_sigma_z_ratio = float(np.exp(GRID_NODE_SPACING * log_sigma_ratio_node))
+        def fit_axes_with_sigma_ratio(log_sigma_ratio_grid_index: int) -> list[PositionFit]:
+            sigma_a_to_sigma_z_ratio = float(np.exp(GRID_NODE_SPACING * log_sigma_ratio_grid_index))
             return [
                 fit_with_sigma_ratios(
                     [positions], [sigma_a_to_sigma_z_ratio], 0.0, measurement_weights, sigma_z_m
                 )[0]
-                for positions in axis_positions
+                for positions in positions_by_axis
             ]
 
         @cache
         def compute_scores_with_sigma_ratio(
-            log_sigma_ratio_node: int, log_sigma_z_node: int
+            log_sigma_ratio_grid_index: int, log_sigma_z_grid_index: int
         ) -> Array:
-            sigma_factors = np.exp(GRID_NODE_SPACING * (log_sigma_z_node + GRID_NODES))
+            sigma_factors = np.exp(GRID_NODE_SPACING * (log_sigma_z_grid_index + GRID_NODES))
             scores_by_axis = [
                 axis_fit.compute_scores(sigma_factors)[:, 0]
-                for axis_fit in fit_axes_with_sigma_ratio(log_sigma_ratio_node)
+                for axis_fit in fit_axes_with_sigma_ratio(log_sigma_ratio_grid_index)
             ]
             return np.asarray(np.sum(scores_by_axis, axis=0))
 
         @cache
-        def compute_scores_at_nodes(log_sigma_ratio_node: int, log_sigma_z_node: int) -> Array:
+        def compute_scores_at_nodes(
+            log_sigma_ratio_grid_index: int, log_sigma_z_grid_index: int
+        ) -> Array:
             return np.array(
                 [
-                    compute_scores_with_sigma_ratio(log_sigma_ratio_node + node, log_sigma_z_node)
+                    compute_scores_with_sigma_ratio(
+                        log_sigma_ratio_grid_index + node, log_sigma_z_grid_index
+                    )
                     for node in range(GRID_NODE_COUNT)
                 ]
             )
@@ -161,24 +165,28 @@ class NegativeLogLikelihood:
             or not self.is_interpolated
         ):
             return negative_log_likelihood(
-                self.axis_positions, noise_parameters, self.measurement_weights
+                self.positions_by_axis, noise_parameters, self.measurement_weights
             )
         log_sigma_z_in_node_steps = log(noise_parameters.sigma_z_m) / GRID_NODE_SPACING
         log_sigma_ratio_in_node_steps = (
             log(noise_parameters.sigma_a_m_s2) / GRID_NODE_SPACING - log_sigma_z_in_node_steps
         )
         grid_nodes_below_value = (GRID_NODE_COUNT - 1) // 2
-        first_log_sigma_ratio_node = floor(log_sigma_ratio_in_node_steps) - grid_nodes_below_value
-        first_log_sigma_z_node = floor(log_sigma_z_in_node_steps) - grid_nodes_below_value
+        first_log_sigma_ratio_grid_index = (
+            floor(log_sigma_ratio_in_node_steps) - grid_nodes_below_value
+        )
+        first_log_sigma_z_grid_index = floor(log_sigma_z_in_node_steps) - grid_nodes_below_value
         log_sigma_ratio_interpolation_weights = _compute_interpolation_weights(
-            log_sigma_ratio_in_node_steps - first_log_sigma_ratio_node
+            log_sigma_ratio_in_node_steps - first_log_sigma_ratio_grid_index
         )
         log_sigma_z_interpolation_weights = _compute_interpolation_weights(
-            log_sigma_z_in_node_steps - first_log_sigma_z_node
+            log_sigma_z_in_node_steps - first_log_sigma_z_grid_index
         )
         return float(
             log_sigma_ratio_interpolation_weights
-            @ self._compute_scores_at_nodes(first_log_sigma_ratio_node, first_log_sigma_z_node)
+            @ self._compute_scores_at_nodes(
+                first_log_sigma_ratio_grid_index, first_log_sigma_z_grid_index
+            )
             @ log_sigma_z_interpolation_weights
         )
 
@@ -260,7 +268,7 @@ def fit_constant_errors(
 
 
 def negative_log_likelihood(
-    axis_positions: Sequence[PositionsAndIncrements],
+    positions_by_axis: Sequence[PositionsAndIncrements],
     noise_parameters: NoiseParameters,
     measurement_weights: Array,
 ) -> float:
@@ -270,7 +278,7 @@ def negative_log_likelihood(
             fit_constant_errors(
                 [positions], noise_parameters, measurement_weights
             ).compute_scores()[0, 0]
-            for positions in axis_positions
+            for positions in positions_by_axis
         )
     )
 
@@ -289,7 +297,7 @@ class NoiseFit:
         1 for a good measurement, smaller for an outlier.
     score : NegativeLogLikelihood
         -ln p as a function of the noise parameters.
-    log_sigma_z_variance_factor : float
+    variance_factor_of_ln_sigma_z : float
         Increase of the variance of ln SIGMA_Z by uncertain outliers; at least 1.
     """
 
@@ -297,7 +305,7 @@ class NoiseFit:
     measurement_weights: Array
     outlier_probability: Array
     score: NegativeLogLikelihood
-    log_sigma_z_variance_factor: float
+    variance_factor_of_ln_sigma_z: float
     outlier_fraction: float
     outlier_sigma_ratio: float
 
@@ -331,7 +339,7 @@ def convert_to_positions_and_increments(
             process_noise_per_sigma_a_squared=preintegrated_motion.process_noise_per_sigma_a_squared.T,
             process_noise_independent_of_sigma_a=preintegrated_motion.process_noise_independent_of_sigma_a.T,
             prior_precision=prior_precision,
-            constant_prior_sigmas=np.sqrt([INITIAL_COVARIANCE[0], INITIAL_COVARIANCE[2]]),
+            prior_sigmas_of_constant_errors=np.sqrt([INITIAL_COVARIANCE[0], INITIAL_COVARIANCE[2]]),
             delta_position_m=dp,
             delta_velocity_m_s=dv,
         )
@@ -339,7 +347,7 @@ def convert_to_positions_and_increments(
 
 
 def maximise_likelihood(
-    axis_positions: Sequence[PositionsAndIncrements],
+    positions_by_axis: Sequence[PositionsAndIncrements],
     start_parameters: NoiseParameters,
     measurement_weights: Array,
     fits_outliers: bool = True,
@@ -348,7 +356,7 @@ def maximise_likelihood(
 
     Parameters
     ----------
-    axis_positions : sequence of PositionsAndIncrements
+    positions_by_axis : sequence of PositionsAndIncrements
         Positions along each axis, at equal times.
     start_parameters : NoiseParameters
         Initial values. Random walk or time-correlated noise of zero stays zero.
@@ -367,7 +375,7 @@ def maximise_likelihood(
                 - len(measurement_weights)
                 + INITIAL_FIT_MEASUREMENT_COUNT
             )
-            for positions in axis_positions
+            for positions in positions_by_axis
         ]
         first_fit = maximise_likelihood(
             positions_of_first_fit,
@@ -379,12 +387,12 @@ def maximise_likelihood(
         outlier_fraction = first_fit.outlier_fraction
         outlier_sigma_ratio = first_fit.outlier_sigma_ratio
     likelihood = NegativeLogLikelihood(
-        axis_positions, measurement_weights, start_parameters.sigma_z_m
+        positions_by_axis, measurement_weights, start_parameters.sigma_z_m
     )
     noise_parameters = _maximise_by_gradient(likelihood, start_parameters)
     for _ in range(MAX_OUTLIER_ITERATIONS if fits_outliers else 0):
         expected_squared_errors_m2, measured_axis_counts = _estimate_squared_errors(
-            axis_positions, noise_parameters, measurement_weights
+            positions_by_axis, noise_parameters, measurement_weights
         )
         # Outliers increase the estimated SIGMA_Z, but hardly the median of the squared errors
         robust_variance_m2 = float(
@@ -394,11 +402,11 @@ def maximise_likelihood(
         # If most errors exceed the search range of SIGMA_Z, no measurement is treated as an outlier
         if robust_variance_m2 > SIGMA_Z_SEARCH_RANGE_M[1] ** 2:
             break
-        limited_sigma_z_variance_m2 = min(
+        limited_measurement_variance_m2 = min(
             noise_parameters.sigma_z_m**2,
             MAX_SIGMA_Z_TO_MEDIAN_BASED_SIGMA_Z_RATIO**2 * robust_variance_m2,
         )
-        normalised_squares = expected_squared_errors_m2 / limited_sigma_z_variance_m2
+        normalised_squares = expected_squared_errors_m2 / limited_measurement_variance_m2
         previous_probability = outlier_probability
         for _ in range(MAX_OUTLIER_ITERATIONS if is_long else 1):
             outlier_probability = _compute_outlier_probability(
@@ -424,23 +432,23 @@ def maximise_likelihood(
             break
         measurement_weights = 1.0 - outlier_probability * (1.0 - outlier_sigma_ratio**-2.0)
         likelihood = NegativeLogLikelihood(
-            axis_positions, measurement_weights, start_parameters.sigma_z_m
+            positions_by_axis, measurement_weights, start_parameters.sigma_z_m
         )
         noise_parameters = _maximise_by_gradient(
             likelihood,
-            replace(noise_parameters, sigma_z_m=float(np.sqrt(limited_sigma_z_variance_m2))),
+            replace(noise_parameters, sigma_z_m=float(np.sqrt(limited_measurement_variance_m2))),
         )
         if (
             np.abs(outlier_probability - previous_probability).max()
             < MAX_OUTLIER_PROBABILITY_CHANGE
         ):
             break
-    log_sigma_z_variance_factor = 1.0
+    variance_factor_of_ln_sigma_z = 1.0
     if outlier_probability.any():
         expected_squared_errors_m2, measured_axis_counts = _estimate_squared_errors(
-            axis_positions, noise_parameters, measurement_weights
+            positions_by_axis, noise_parameters, measurement_weights
         )
-        log_sigma_z_variance_factor = compute_log_sigma_z_variance_factor(
+        variance_factor_of_ln_sigma_z = compute_variance_factor_of_ln_sigma_z(
             expected_squared_errors_m2 / noise_parameters.sigma_z_m**2,
             measured_axis_counts,
             outlier_probability,
@@ -451,21 +459,21 @@ def maximise_likelihood(
         measurement_weights,
         outlier_probability,
         likelihood,
-        log_sigma_z_variance_factor,
+        variance_factor_of_ln_sigma_z,
         outlier_fraction,
         outlier_sigma_ratio,
     )
 
 
 def estimate_outlier_probability(
-    axis_positions: Sequence[PositionsAndIncrements], fit: NoiseFit, measurement_count: int
+    positions_by_axis: Sequence[PositionsAndIncrements], fit: NoiseFit, measurement_count: int
 ) -> Array:
     """Return the probability of each measurement to be an outlier, with the noises of ``fit``."""
     outlier_probability = np.zeros(measurement_count)
     for _ in range(OUTLIER_ITERATIONS_WITH_GIVEN_NOISES):
         measurement_weights = 1.0 - outlier_probability * (1.0 - fit.outlier_sigma_ratio**-2.0)
         expected_squared_errors_m2, measured_axis_counts = _estimate_squared_errors(
-            axis_positions, fit.noise_parameters, measurement_weights
+            positions_by_axis, fit.noise_parameters, measurement_weights
         )
         outlier_probability = _compute_outlier_probability(
             expected_squared_errors_m2 / fit.noise_parameters.sigma_z_m**2,
@@ -477,7 +485,7 @@ def estimate_outlier_probability(
 
 
 def _estimate_squared_errors(
-    axis_positions: Sequence[PositionsAndIncrements],
+    positions_by_axis: Sequence[PositionsAndIncrements],
     noise_parameters: NoiseParameters,
     measurement_weights: Array,
 ) -> tuple[Array, Array]:
@@ -486,10 +494,10 @@ def _estimate_squared_errors(
     The squared error is summed over the measured axes.
     """
     squared_errors_and_axis_counts = []
-    for positions in axis_positions:
+    for positions in positions_by_axis:
         constant_errors = fit_constant_errors(
             [positions], noise_parameters, measurement_weights
-        ).estimate_segment_constants()[:, 0]
+        ).estimate_constant_errors_by_segment()[:, 0]
         positions_with_random_walk, measurement_variance_m2 = positions.divide_sigmas_by_sigma_z(
             1.0, noise_parameters.random_walk_m, measurement_weights / noise_parameters.sigma_z_m**2
         )
@@ -521,7 +529,7 @@ def _compute_outlier_probability(
     )
 
 
-def compute_log_sigma_z_variance_factor(
+def compute_variance_factor_of_ln_sigma_z(
     normalised_squares: Array,
     measured_axis_counts: Array,
     outlier_probability: Array,

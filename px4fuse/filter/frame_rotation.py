@@ -238,17 +238,19 @@ def _compare_orientations(
     # Robust σ from the differences of successive samples
     noise_sigma_rad = 1.4826 * np.median(np.abs(np.diff(misalignment_rad))) / np.sqrt(2.0)
     sigma_rad = max(float(noise_sigma_rad), np.radians(MIN_HEADING_SIGMA_DEG))
-    heading_parts = _average_flight_parts(time_s, misalignment_rad, sigma_rad)
-    if len(heading_parts) < MIN_FLIGHT_PART_COUNT:
+    heading_errors_of_parts = _average_flight_parts(time_s, misalignment_rad, sigma_rad)
+    if len(heading_errors_of_parts) < MIN_FLIGHT_PART_COUNT:
         return None
     heading_errors_deg = np.array(
-        [heading_part.heading_error_deg for heading_part in heading_parts]
+        [heading_part.heading_error_deg for heading_part in heading_errors_of_parts]
     )
     chi_square = (
         np.sum((heading_errors_deg - heading_errors_deg.mean()) ** 2) / np.degrees(sigma_rad) ** 2
     )
     return combine_heading_parts(
-        heading_parts, float(chdtrc(len(heading_parts) - 1, chi_square)), "orientation"
+        heading_errors_of_parts,
+        float(chdtrc(len(heading_errors_of_parts) - 1, chi_square)),
+        "orientation",
     )
 
 
@@ -295,22 +297,28 @@ def _estimate_heading_error_from_positions(
                 f"{MIN_HEADING_FIT_DURATION_S:g} s",
                 "Analyse a longer segment.",
             )
-        positions = motion.make_positions_at_offset(0.0)
+        positions_and_increments = motion.make_positions_at_offset(0.0)
         # Effect of a heading error: motion along the smooth path through the positions (last row),
         # rotated by 90°. With the noisy motion from the IMU, the estimate would be too small
-        for increments in (positions.delta_position_m, positions.delta_velocity_m_s):
+        for increments in (
+            positions_and_increments.delta_position_m,
+            positions_and_increments.delta_velocity_m_s,
+        ):
             north_m, east_m = increments[:, :, -1]
             increments[:, :, 1 + HEADING_ERROR_INDEX] = -east_m, north_m
         noise_parameters = maximise_likelihood(
-            [positions], noise_parameters, motion.measurement_weights, fits_outliers=False
+            [positions_and_increments],
+            noise_parameters,
+            motion.measurement_weights,
+            fits_outliers=False,
         ).noise_parameters
         position_fit = fit_constant_errors(
-            [positions], noise_parameters, motion.measurement_weights
+            [positions_and_increments], noise_parameters, motion.measurement_weights
         )
-        constant_errors = position_fit.estimate_segment_constants()[is_part_long_enough, 0]
-        constant_errors_covariance = np.linalg.inv(position_fit.compute_constants_information())[
-            is_part_long_enough, 0
-        ]
+        constant_errors = position_fit.estimate_constant_errors_by_segment()[is_part_long_enough, 0]
+        constant_errors_covariance = np.linalg.inv(
+            position_fit.compute_constant_error_information()
+        )[is_part_long_enough, 0]
         # The smooth path has the scale of the measured positions, but a heading error rotates true
         # distances: divide the fitted heading error by the ratio of true to measured distances
         true_to_measured_scale = np.maximum(

@@ -160,7 +160,7 @@ def fit_systematic_errors(
     sigma_z_m: float,
     outlier_time_s: Array,
     clock_offset_s: float,
-    source_resets_s: Sequence[float] = (),
+    source_reset_times_s: Sequence[float] = (),
 ) -> SystematicErrors | Unavailable:
     """Estimate biases, frame rotation and scale factor error, and detect jumps of the positions.
 
@@ -176,7 +176,7 @@ def fit_systematic_errors(
         Timestamps of measurements to exclude.
     clock_offset_s : float
         Time offset added to the timestamps.
-    source_resets_s : sequence of float
+    source_reset_times_s : sequence of float
         Timestamps of resets that the position source reports.
     """
     initial_design = make_design_matrix(
@@ -191,7 +191,7 @@ def fit_systematic_errors(
     design_matrix, regression = _fit_sigma_a(initial_design, tested_sigmas_a, is_outlier)
     # The mask of outliers is corrected: it can contain correct positions after a jump, and can lack
     # outliers near a jump
-    jumps, is_skipped = _find_jumps(design_matrix, regression, is_outlier, source_resets_s)
+    jumps, is_skipped = _find_jumps(design_matrix, regression, is_outlier, source_reset_times_s)
     # SIGMA_A is fitted again, because jumps that are not modelled enlarge its estimate
     if jumps:
         design_matrix = replace(design_matrix, jump_times_s=[jump.time_s for jump in jumps])
@@ -247,11 +247,11 @@ def _fit_scale(design_matrix: DesignMatrix, is_skipped: BoolArray) -> Estimate:
     grid_step = tested_scales[1] - tested_scales[0]
     best_scale = tested_scales[centre_index] + float(np.clip(vertex_shift, -1.5, 1.5)) * grid_step
     centre_fit = fit_scale(centre_index)
-    length_factor_of_linear_rotation = math.hypot(
+    lengthening_factor_of_linearised_rotation = math.hypot(
         1.0, centre_fit.coefficients[FRAME_ROTATION_COLUMN]
     )
     return Estimate(
-        float(best_scale * length_factor_of_linear_rotation - 1.0),
+        float(best_scale * lengthening_factor_of_linearised_rotation - 1.0),
         grid_step / math.sqrt(curvature) * max(centre_fit.residual_rms, 1.0),
     )
 
@@ -260,7 +260,7 @@ def _find_jumps(
     design_matrix: DesignMatrix,
     fit: InnovationRegression,
     is_skipped: BoolArray,
-    source_resets_s: Sequence[float],
+    source_reset_times_s: Sequence[float],
 ) -> tuple[tuple[Jump, ...], BoolArray]:
     """Detect lasting jumps of the positions; return them in time order, and a mask of outliers.
 
@@ -278,7 +278,7 @@ def _find_jumps(
 
     def mask_outliers_near_jump(jump_time_s: float) -> BoolArray:
         # Positions after a reset that the source reports are valid, even if they are in the mask
-        if jump_time_s in source_resets_s:
+        if jump_time_s in source_reset_times_s:
             return is_skipped & ~_is_in_window(
                 time_s, jump_time_s, OUTLIER_RETEST_DURATION_AFTER_JUMP_S
             )
@@ -289,7 +289,7 @@ def _find_jumps(
             np.flatnonzero(is_skipped & ~np.append(False, is_skipped[:-1]))
         ]
         candidate_times_s = [
-            *source_resets_s,
+            *source_reset_times_s,
             *_find_significant_jump_times(design_matrix, fit, is_skipped, outlier_run_starts_s),
             *_find_significant_jump_times(design_matrix, fit, is_skipped, measurement_times_s)[:1],
         ]
@@ -309,9 +309,9 @@ def _find_jumps(
         jumps.append(best_jump)
         design_matrix = replace(design_matrix, jump_times_s=[jump.time_s for jump in jumps])
         fit = design_matrix.fit(is_skipped)
-        source_resets_s = [
+        source_reset_times_s = [
             reset_time_s
-            for reset_time_s in source_resets_s
+            for reset_time_s in source_reset_times_s
             if abs(reset_time_s - best_jump.time_s) > OUTLIER_BURST_DURATION_S
         ]
     return tuple(sorted(jumps, key=lambda jump: jump.time_s)), is_skipped
@@ -356,10 +356,10 @@ def _compute_jump_chi_squares(
         # Jumps have no effect on earlier innovations
         rows = slice(np.searchsorted(design_matrix.time_s, candidate_times_s[first]), None)
         is_used = ~is_skipped[rows]
-        jump_steps = make_unit_steps(design_matrix.time_s[rows], candidate_times_s[batch])
-        zero_increments = np.zeros_like(jump_steps)
+        unit_steps = make_unit_steps(design_matrix.time_s[rows], candidate_times_s[batch])
+        zero_increments = np.zeros_like(unit_steps)
         jump_response = design_matrix.compute_normalised_innovations(
-            zero_increments, zero_increments, jump_steps, fit_without_jump.gains[:, rows]
+            zero_increments, zero_increments, unit_steps, fit_without_jump.gains[:, rows]
         )[is_used]
         for columns, residual, residual_rms in zip(
             columns_by_axis,
@@ -551,10 +551,10 @@ class DesignMatrix:
         gains = compute_gains(
             self.preintegrated_inputs, scale * self.sigma_a_m_s2, self.sigma_z_m, is_skipped
         )
-        innovations_of_data, columns = self.compute_innovations_and_design_matrix(gains, scale)
+        normalised_innovations, columns = self.compute_innovations_and_design_matrix(gains, scale)
         sum_of_log_variances = self.axis_count * float(np.sum(np.log(gains[0, ~is_skipped])))
         is_used = np.tile(~is_skipped, self.axis_count)
-        used_innovations, used_columns = innovations_of_data[is_used], columns[is_used]
+        used_innovations, used_columns = normalised_innovations[is_used], columns[is_used]
         prior_precision = np.zeros(columns.shape[1])
         prior_precision[: len(self.prior_sigma)] = self.prior_sigma**-2.0
         information = np.diag(prior_precision) + used_columns.T @ used_columns
@@ -568,7 +568,7 @@ class DesignMatrix:
         square_sum = float(used_innovations @ used_innovations - coefficients @ right_hand_side)
         log_determinant = 2.0 * float(np.sum(np.log(np.diag(information_factor[0]))))
         degrees_of_freedom = max(len(used_innovations) - CONSTANT_ERROR_COLUMN_COUNT, 1)
-        residual = (innovations_of_data - columns @ coefficients).reshape(self.axis_count, -1)
+        residual = (normalised_innovations - columns @ coefficients).reshape(self.axis_count, -1)
         mean_squares = np.mean(residual[:, ~is_skipped] ** 2, axis=1)
         return InnovationRegression(
             residual,
@@ -591,19 +591,19 @@ class DesignMatrix:
         input_count = inputs.measurement_m.shape[1]
         # Only inputs with measured acceleration are multiplied by the scale factor
         input_scale_factors = np.ones(input_count)
-        data_inputs = INPUTS_PER_AXIS * np.arange(axis_count)
-        input_scale_factors[data_inputs] = scale
-        input_scale_factors[data_inputs + 1 + FRAME_ROTATION_COLUMN] = scale
-        jump_steps = make_unit_steps(self.time_s, self.jump_times_s)
-        zero_increments = np.zeros_like(jump_steps)
+        acceleration_input_indices = INPUTS_PER_AXIS * np.arange(axis_count)
+        input_scale_factors[acceleration_input_indices] = scale
+        input_scale_factors[acceleration_input_indices + 1 + FRAME_ROTATION_COLUMN] = scale
+        unit_steps = make_unit_steps(self.time_s, self.jump_times_s)
+        zero_increments = np.zeros_like(unit_steps)
         responses = self.compute_normalised_innovations(
             np.hstack([input_scale_factors * inputs.delta_position_m, zero_increments]),
             np.hstack([input_scale_factors * inputs.delta_velocity_m_s, zero_increments]),
-            np.hstack([inputs.measurement_m, jump_steps]),
+            np.hstack([inputs.measurement_m, unit_steps]),
             gains,
         )
         *responses_by_axis, slow_error_responses, jump_responses = np.split(
-            responses, [*(data_inputs + INPUTS_PER_AXIS), input_count], axis=1
+            responses, [*(acceleration_input_indices + INPUTS_PER_AXIS), input_count], axis=1
         )
         stacked_responses = np.vstack(responses_by_axis)
         # Slow errors and jumps of an axis have no effect on the other axis
@@ -648,7 +648,7 @@ def make_design_matrix(
             prediction_steps, np.diff(velocity_m_s) / np.diff(prediction_steps.time_s)
         )
 
-    unit_errors = _integrate_unit_errors(attitude, acceleration)
+    velocity_errors_per_unit_bias_and_yaw = _integrate_unit_errors(attitude, acceleration)
     # Δp (m) and Δv (m/s) between the measurements, for each input of KF
     increments: list[ArrayPair] = []
     for axis, preintegrated_motion in zip(axes, preintegrated_motions, strict=True):
@@ -657,17 +657,17 @@ def make_design_matrix(
         )
         increments += [
             integrate_between_measurements(velocity_error_m_s @ axis.direction, error_time_s)
-            for error_time_s, velocity_error_m_s in unit_errors
+            for error_time_s, velocity_error_m_s in velocity_errors_per_unit_bias_and_yaw
         ]
     # The slow acceleration error is linear between knots
-    slow_error_intervals = int(
+    slow_error_knot_interval_count = int(
         np.clip(
             np.ceil((time_s[-1] - time_s[0]) / SLOW_ERROR_KNOT_SPACING_S), 1, MAX_SLOW_ERROR_KNOTS
         )
     )
-    slow_error_time_s = np.linspace(time_s[0], time_s[-1], 20 * slow_error_intervals + 1)
+    slow_error_time_s = np.linspace(time_s[0], time_s[-1], 20 * slow_error_knot_interval_count + 1)
     slow_error_time_s += clock_offset_s
-    for knot_values in np.eye(slow_error_intervals + 1):
+    for knot_values in np.eye(slow_error_knot_interval_count + 1):
         slow_error = np.interp(slow_error_time_s, slow_error_time_s[::20], knot_values)
         increments.append(
             integrate_between_measurements(
@@ -691,7 +691,7 @@ def make_design_matrix(
         ),
     )
     prior_sigma = np.full(
-        CONSTANT_ERROR_COLUMN_COUNT + len(axes) * (slow_error_intervals + 1),
+        CONSTANT_ERROR_COLUMN_COUNT + len(axes) * (slow_error_knot_interval_count + 1),
         TILT_PRIOR_SIGMA_RAD * constants.g,
     )
     prior_sigma[:CONSTANT_ERROR_COLUMN_COUNT] = np.inf

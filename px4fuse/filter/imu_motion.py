@@ -52,7 +52,7 @@ from px4fuse.trajectory.rotation import (
 HEADING_SIGMA_RAD = 0.05
 # Prior σ of the constant errors of a segment: initial attitude (rad), gyro bias (rad/s) and
 # accelerometer bias (m/s²) along three axes, and position scale (1)
-PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
+PRIOR_SIGMAS_OF_CONSTANT_ERRORS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
 # A gyro bias above this limit (rad/s; 5 σ of the prior) is subtracted before the fit
 MAX_PRIOR_GYRO_BIAS_RAD_S = 0.02
 # Maximum gyro bias (rad/s) that EKF2 can remove from its attitude: the maximum of EKF2_GYR_B_LIM
@@ -62,7 +62,7 @@ MAX_SEGMENT_DURATION_S = 30.0
 # Maximum tested time offset (s) between position source and IMU
 MAX_TESTED_TIME_OFFSET_S = 0.6
 COARSE_OFFSET_COUNT = 25
-COARSE_MEASUREMENT_COUNT = 600
+COARSE_SEARCH_MEASUREMENT_COUNT = 600
 # Minimum number of position measurements in all segments together
 MIN_TOTAL_MEASUREMENTS = 30
 MIN_SEGMENT_MEASUREMENTS = 15
@@ -81,13 +81,13 @@ MAX_IMU_INTERVAL_S = 0.025
 class SegmentMotion:
     """Motion of one segment from the IMU, and its derivatives with respect to IMU errors.
 
-    ``motion_and_derivatives``, shape (2, 3, 10, times), contains position and velocity along NED.
-    The third dimension is the motion, then its derivatives with respect to initial attitude error,
-    gyro bias and accelerometer bias.
+    ``motion_and_imu_error_derivatives``, shape (2, 3, 10, times), contains position and velocity
+    along NED. The third dimension is the motion, then its derivatives with respect to initial
+    attitude error, gyro bias and accelerometer bias.
     """
 
     time_s: Array
-    motion_and_derivatives: Array
+    motion_and_imu_error_derivatives: Array
 
     def interpolate(self, time_s: Array) -> tuple[Array, Array]:
         """Return position and velocity at other times, each with the shape (3, 10, ...).
@@ -97,8 +97,8 @@ class SegmentMotion:
         last_index = len(self.time_s) - 2
         row = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last_index)
         elapsed_s = time_s - self.time_s[row]
-        position, velocity = self.motion_and_derivatives.take(row, axis=-1)
-        next_velocity = self.motion_and_derivatives[1].take(row + 1, axis=-1)
+        position, velocity = self.motion_and_imu_error_derivatives.take(row, axis=-1)
+        next_velocity = self.motion_and_imu_error_derivatives[1].take(row + 1, axis=-1)
         acceleration = (next_velocity - velocity) / INTEGRATION_STEP_S
         position += elapsed_s * (velocity + (0.5 * elapsed_s) * acceleration)
         velocity += elapsed_s * acceleration
@@ -174,7 +174,7 @@ class PositionsAndImuMotion:
         )
         prior_precision = np.zeros((len(self.time_s), 2))
         prior_precision[self.segment_edges[:-1]] = INITIAL_STATE_PRIOR_PRECISIONS
-        column_count = 1 + len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS)
+        column_count = 1 + len(PRIOR_SIGMAS_OF_CONSTANT_ERRORS)
         dp, dv = np.zeros(
             (2, len(self.directions), len(time_offsets_s), column_count, len(interval_s))
         )
@@ -200,10 +200,10 @@ class PositionsAndImuMotion:
             process_noise_per_sigma_a_squared=process_noise_per_sigma_a_squared,
             process_noise_independent_of_sigma_a=np.zeros_like(process_noise_per_sigma_a_squared),
             prior_precision=prior_precision,
-            constant_prior_sigmas=np.r_[
-                PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS[:2],
+            prior_sigmas_of_constant_errors=np.r_[
+                PRIOR_SIGMAS_OF_CONSTANT_ERRORS[:2],
                 self.heading_sigma_rad,
-                PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS[3:],
+                PRIOR_SIGMAS_OF_CONSTANT_ERRORS[3:],
             ],
             delta_position_m=dp,
             delta_velocity_m_s=dv,
@@ -225,7 +225,7 @@ class PositionsAndImuMotion:
         With ``estimates_scale``, the scale factor of the positions can be estimated.
         """
         element_count = (
-            len(time_offsets_s) * self.measurement_m.size * len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS)
+            len(time_offsets_s) * self.measurement_m.size * len(PRIOR_SIGMAS_OF_CONSTANT_ERRORS)
         )
         segment_count = len(self.segment_motions)
         batch_count = min(-(-element_count // MAX_BATCH_ELEMENTS), segment_count)
@@ -266,15 +266,15 @@ class PositionsAndImuMotion:
             sigma_a_factor * noise_parameters.sigma_a_m_s2 / sigma_z_m
             for sigma_a_factor in sigma_a_factors
         ]
-        coarse_motion = self.downsample(COARSE_MEASUREMENT_COUNT)
-        position_batches = coarse_motion.make_position_batches(
+        downsampled_motion = self.downsample(COARSE_SEARCH_MEASUREMENT_COUNT)
+        position_batches = downsampled_motion.make_position_batches(
             tested_offsets_s, estimates_scale=estimates_scale
         )
         fits_by_sigma_ratio = fit_with_sigma_ratios(
             position_batches,
             sigma_a_to_sigma_z_ratios,
             noise_parameters.random_walk_m / sigma_z_m,
-            coarse_motion.measurement_weights,
+            downsampled_motion.measurement_weights,
             sigma_z_m,
         )
         # Shape (SIGMA_A factors, time offsets)
@@ -444,10 +444,10 @@ def make_segment_motion(
     )
     specific_force_ned_m_s2 = rotate(body_to_ned, mean_specific_force_m_s2).T
     body_to_ned = np.moveaxis(body_to_ned, 0, -1)
-    motion_and_derivatives = np.zeros(
-        (2, 3, len(PRIOR_SIGMAS_OF_SEGMENT_CONSTANTS), len(mean_specific_force_m_s2))
+    motion_and_imu_error_derivatives = np.zeros(
+        (2, 3, len(PRIOR_SIGMAS_OF_CONSTANT_ERRORS), len(mean_specific_force_m_s2))
     )
-    position, velocity = motion_and_derivatives
+    position, velocity = motion_and_imu_error_derivatives
     acceleration = np.zeros_like(velocity)
     acceleration[:, 0] = specific_force_ned_m_s2
     acceleration[2, 0] += constants.g
@@ -469,7 +469,7 @@ def make_segment_motion(
     np.cumsum(velocity_increments, axis=-1, out=velocity[..., 1:])
     mean_velocity_in_step = velocity[..., :-1] + velocity_increments / 2.0
     np.cumsum(mean_velocity_in_step * INTEGRATION_STEP_S, axis=-1, out=position[..., 1:])
-    return SegmentMotion(step_times_s[:-1], motion_and_derivatives)
+    return SegmentMotion(step_times_s[:-1], motion_and_imu_error_derivatives)
 
 
 def _estimate_large_gyro_bias(

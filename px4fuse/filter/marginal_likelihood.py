@@ -26,7 +26,7 @@ from scipy.linalg import lapack
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 
-UNCHANGED_SIGMAS = np.ones(1)
+UNIT_SIGMA_FACTOR = np.ones(1)
 # Acceleration noise and position noise of the smoother that estimates a path from the positions
 PATH_SMOOTHER_SIGMA_A_M_S2, PATH_SMOOTHER_SIGMA_Z_M = 0.5, 0.1
 # A position or velocity without a measurement counts as known only if its prior precision (1/m² or
@@ -63,7 +63,7 @@ class PositionsAndIncrements:
         Elements 00, 01, 11 of further process noise, for example in IMU gaps.
     prior_precision : ndarray, shape (m, 2)
         Prior precision of position and velocity; 0 without a prior.
-    constant_prior_sigmas : ndarray, shape (c,)
+    prior_sigmas_of_constant_errors : ndarray, shape (c,)
         Prior σ of the unknown constants of each segment.
     delta_position_m, delta_velocity_m_s : ndarray, shape (a, T, 1 + c, m - 1)
         Δp and Δv in each interval, then their derivatives with respect to each constant.
@@ -77,7 +77,7 @@ class PositionsAndIncrements:
     process_noise_per_sigma_a_squared: Array
     process_noise_independent_of_sigma_a: Array
     prior_precision: Array
-    constant_prior_sigmas: Array
+    prior_sigmas_of_constant_errors: Array
     delta_position_m: Array
     delta_velocity_m_s: Array
     correlated_noise: tuple[float, float] | None = None
@@ -204,14 +204,14 @@ class PositionFit:
         Log determinant of the covariance of the positions.
     degrees_of_freedom : int
         Number of measured positions minus the number needed for the initial states.
-    constant_prior_sigmas : ndarray, shape (c,)
+    prior_sigmas_of_constant_errors : ndarray, shape (c,)
         Prior σ of the c constant errors.
     """
 
     gram_matrix: Array
     covariance_log_determinant: float
     degrees_of_freedom: int
-    constant_prior_sigmas: Array
+    prior_sigmas_of_constant_errors: Array
 
     def scale_sigmas(self, factor: float) -> PositionFit:
         """Return the fit with the σ of all noises multiplied by ``factor``."""
@@ -222,19 +222,19 @@ class PositionFit:
             + 2.0 * self.degrees_of_freedom * math.log(factor),
         )
 
-    def compute_constants_information(self) -> Array:
+    def compute_constant_error_information(self) -> Array:
         """Return information matrices of the constant errors, shape (segments, offsets, c, c)."""
-        return self.gram_matrix[..., 1:, 1:] + np.diag(self.constant_prior_sigmas**-2.0)
+        return self.gram_matrix[..., 1:, 1:] + np.diag(self.prior_sigmas_of_constant_errors**-2.0)
 
-    def estimate_segment_constants(self) -> Array:
+    def estimate_constant_errors_by_segment(self) -> Array:
         """Return the estimated constant errors, shape (segments, time offsets, c)."""
         return np.asarray(
-            -np.linalg.solve(self.compute_constants_information(), self.gram_matrix[..., 1:, :1])[
-                ..., 0
-            ]
+            -np.linalg.solve(
+                self.compute_constant_error_information(), self.gram_matrix[..., 1:, :1]
+            )[..., 0]
         )
 
-    def compute_segment_scores(self, sigma_factors: Array = UNCHANGED_SIGMAS) -> Array:
+    def compute_segment_scores(self, sigma_factors: Array = UNIT_SIGMA_FACTOR) -> Array:
         """Return -ln p of the positions in each segment, shape (factors, segments, time offsets).
 
         All σ are multiplied by each of ``sigma_factors``. A term that is equal for all time offsets
@@ -243,22 +243,24 @@ class PositionFit:
         gram_matrix_over_sigma_factor_squared = (
             self.gram_matrix / sigma_factors[:, None, None, None, None] ** 2
         )
-        prior_sigmas = self.constant_prior_sigmas
+        prior_sigmas = self.prior_sigmas_of_constant_errors
         normalised_information_matrix = gram_matrix_over_sigma_factor_squared[
             ..., 1:, 1:
         ] * np.outer(prior_sigmas, prior_sigmas) + np.eye(len(prior_sigmas))
-        cross_products = gram_matrix_over_sigma_factor_squared[..., 1:, 0] * prior_sigmas
+        normalised_right_hand_side = (
+            gram_matrix_over_sigma_factor_squared[..., 1:, 0] * prior_sigmas
+        )
         cholesky_factor = np.linalg.cholesky(normalised_information_matrix)
         estimated_constants = np.linalg.solve(
-            normalised_information_matrix, cross_products[..., None]
+            normalised_information_matrix, normalised_right_hand_side[..., None]
         )[..., 0]
         half_log_determinant = np.log(np.diagonal(cholesky_factor, axis1=-2, axis2=-1)).sum(axis=-1)
         square_sum = gram_matrix_over_sigma_factor_squared[..., 0, 0] - np.sum(
-            cross_products * estimated_constants, axis=-1
+            normalised_right_hand_side * estimated_constants, axis=-1
         )
         return np.asarray(0.5 * square_sum + half_log_determinant)
 
-    def compute_scores(self, sigma_factors: Array = UNCHANGED_SIGMAS) -> Array:
+    def compute_scores(self, sigma_factors: Array = UNIT_SIGMA_FACTOR) -> Array:
         """Return -ln p of the positions, shape (factors, time offsets), without a constant term.
 
         All σ are multiplied by each of ``sigma_factors``.
@@ -308,11 +310,13 @@ def fit_positions(
             increments = dp[interval_index], dv[interval_index]
             batch_system = system.select_rows(rows)
             weighted_increments = batch_system.weight_increments(*increments)
-            part_explained_by_states = batch_system.whiten(batch_measured_m, *weighted_increments)
+            whitened_explained_part = batch_system.whiten_explained_part(
+                batch_measured_m, *weighted_increments
+            )
             for sign, left, right, values_per_measurement in (
                 (1.0, increments[0], weighted_increments[0], 1),
                 (1.0, increments[1], weighted_increments[1], 1),
-                (-1.0, part_explained_by_states, part_explained_by_states, system.state_count),
+                (-1.0, whitened_explained_part, whitened_explained_part, system.state_count),
             ):
                 gram_matrix[batch] += sign * _compute_inner_products(
                     left, right, values_per_measurement * edges
@@ -323,7 +327,7 @@ def fit_positions(
                 )
             )
     return PositionFit(
-        gram_matrix, log_determinant, degrees_of_freedom, positions.constant_prior_sigmas
+        gram_matrix, log_determinant, degrees_of_freedom, positions.prior_sigmas_of_constant_errors
     )
 
 
@@ -363,12 +367,10 @@ def subtract_smooth_path(
         path_m = smoothed_state[..., 0]
         path_velocity_m_s = smoothed_state[..., 1]
         measured_m[:, axes] -= path_m[:, 0].T
-        path_position_increment_m = (
-            np.diff(path_m) - positions.interval_s * path_velocity_m_s[..., :-1]
-        )
+        path_delta_position_m = np.diff(path_m) - positions.interval_s * path_velocity_m_s[..., :-1]
         # The measured positions are the same for all tested time offsets. The path that is fitted
         # with the first time offset is therefore subtracted for all of them
-        for array, increment in ((dp, path_position_increment_m), (dv, np.diff(path_velocity_m_s))):
+        for array, increment in ((dp, path_delta_position_m), (dv, np.diff(path_velocity_m_s))):
             array[axes, :, 0] -= increment[:, :1]
             if estimates_scale:
                 array[axes, :, -1] = increment
@@ -415,8 +417,8 @@ def compute_segment_inner_products(
     positions: PositionsAndIncrements,
     sigma_a_m_s2: float,
     variance_m2: Array,
-    left_positions_and_increments: Sequence[Array],
-    right_positions_m: Array,
+    left_factor_positions_and_increments: Sequence[Array],
+    right_factor_positions_m: Array,
 ) -> Array:
     """Return inner products uᵀC⁻¹v of k pairs (u, v) of inputs, shape (segments, k).
 
@@ -427,18 +429,18 @@ def compute_segment_inner_products(
     ----------
     variance_m2 : ndarray, shape (m,)
         Variance of each measurement.
-    left_positions_and_increments : three ndarray
+    left_factor_positions_and_increments : three ndarray
         Positions, Δp and Δv of each u, shapes (axes, k, m) and twice (axes, k, m - 1).
-    right_positions_m : ndarray, shape (axes, k, m)
+    right_factor_positions_m : ndarray, shape (axes, k, m)
         Positions of each v; its Δp and Δv are zero.
     """
-    left_positions_m, *increments = left_positions_and_increments
+    left_factor_positions_m, *increments = left_factor_positions_and_increments
     increments_per_constant_error = (
         positions.delta_position_m[:, 0, 1:],
         positions.delta_velocity_m_s[:, 0, 1:],
     )
     inner_products_by_batch = []
-    for begin in range(0, right_positions_m.shape[1], INNER_PRODUCTS_PER_BATCH):
+    for begin in range(0, right_factor_positions_m.shape[1], INNER_PRODUCTS_PER_BATCH):
         batch = np.s_[:, begin : begin + INNER_PRODUCTS_PER_BATCH]
         dp, dv = (
             np.concatenate(
@@ -449,10 +451,10 @@ def compute_segment_inner_products(
             )
         )
         left_rows, right_rows, constant_error_rows = np.split(
-            np.arange(dp.shape[2]), np.array([1, 2]) * left_positions_m[batch].shape[1]
+            np.arange(dp.shape[2]), np.array([1, 2]) * left_factor_positions_m[batch].shape[1]
         )
         left_and_right_positions_m = np.concatenate(
-            [left_positions_m[batch], right_positions_m[batch]], axis=1
+            [left_factor_positions_m[batch], right_factor_positions_m[batch]], axis=1
         )[:, None]
         gram_matrix = fit_positions(
             replace(positions, delta_position_m=dp, delta_velocity_m_s=dv),
@@ -461,7 +463,7 @@ def compute_segment_inner_products(
             left_and_right_positions_m,
         ).gram_matrix[:, 0]
         information = gram_matrix[:, constant_error_rows[:, None], constant_error_rows] + np.diag(
-            positions.constant_prior_sigmas**-2.0
+            positions.prior_sigmas_of_constant_errors**-2.0
         )
         constant_error_coefficients = np.linalg.solve(
             information, gram_matrix[:, constant_error_rows[:, None], right_rows]
@@ -528,8 +530,8 @@ class BandedNormalEquations:
             inverse_q01 * delta_position_m + inverse_q11 * delta_velocity_m_s,
         )
 
-    def whiten(self, measured_m: Array, *weighted_increments: Array) -> Array:
-        """Return the part of each input that the states explain, shape (..., values).
+    def whiten_explained_part(self, measured_m: Array, *weighted_increments: Array) -> Array:
+        """Return the whitened part of each input that the states explain, shape (..., values).
 
         Its inner products are weighted by the inverse covariance.
         """
@@ -537,11 +539,11 @@ class BandedNormalEquations:
         # LAPACK solves a triangular system with unit diagonal 30 % faster
         diagonal = self.cholesky_factor[0]
         unit_diagonal_factor = self.cholesky_factor / diagonal
-        part_explained_by_states, _ = lapack.dtbtrs(
+        whitened_explained_part, _ = lapack.dtbtrs(
             unit_diagonal_factor, right_hand_side.T, uplo="L", diag="U", overwrite_b=1
         )
         return np.asarray(
-            (part_explained_by_states.T / diagonal).reshape(*weighted_increments[0].shape[:-1], -1)
+            (whitened_explained_part.T / diagonal).reshape(*weighted_increments[0].shape[:-1], -1)
         )
 
     def solve(self, measured_m: Array, delta_position_m: Array, delta_velocity_m_s: Array) -> Array:
@@ -555,17 +557,22 @@ class BandedNormalEquations:
         state, _ = lapack.dpbtrs(self.cholesky_factor, right_hand_side.T, lower=1, overwrite_b=1)
         return np.asarray(state.T.reshape(*delta_position_m.shape[:-1], -1, self.state_count))
 
-    def _make_right_hand_side(self, measured_m: Array, g0: Array, g1: Array) -> Array:
-        """Return the right-hand side b of Ax = b; ``g0`` and ``g1`` are Q⁻¹ [Δp, Δv]."""
-        right_hand_side = np.zeros((*g0.shape[:-1], len(self.precision), self.state_count))
-        right_hand_side[..., 1:, 0] = g0
-        right_hand_side[..., 1:, 1] = g1
-        right_hand_side[..., :-1, 0] -= g0
-        right_hand_side[..., :-1, 1] -= self.interval_s * g0 + g1
+    def _make_right_hand_side(
+        self, measured_m: Array, weighted_dp: Array, weighted_dv: Array
+    ) -> Array:
+        """Return the right-hand side b of Ax = b.
+
+        ``weighted_dp`` and ``weighted_dv`` are Q⁻¹ [Δp, Δv].
+        """
+        right_hand_side = np.zeros((*weighted_dp.shape[:-1], len(self.precision), self.state_count))
+        right_hand_side[..., 1:, 0] = weighted_dp
+        right_hand_side[..., 1:, 1] = weighted_dv
+        right_hand_side[..., :-1, 0] -= weighted_dp
+        right_hand_side[..., :-1, 1] -= self.interval_s * weighted_dp + weighted_dv
         weighted_measurements = self.precision[:, 0] * measured_m
-        right_hand_side_of_first_inputs = right_hand_side[..., : measured_m.shape[-2], :, :]
-        right_hand_side_of_first_inputs[..., 0] += weighted_measurements
-        right_hand_side_of_first_inputs[..., 2:] += weighted_measurements[..., None]
+        right_hand_side_of_measured_inputs = right_hand_side[..., : measured_m.shape[-2], :, :]
+        right_hand_side_of_measured_inputs[..., 0] += weighted_measurements
+        right_hand_side_of_measured_inputs[..., 2:] += weighted_measurements[..., None]
         return right_hand_side.reshape(-1, self.state_count * len(self.precision))
 
     def position_variance(self) -> Array:

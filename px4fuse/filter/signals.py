@@ -77,7 +77,7 @@ class Acceleration:
     time_s : ndarray, shape (n,)
     acceleration_integral_m_s : ndarray, shape (3, n)
         Velocity change since the first IMU sample.
-    acceleration_products_m2_s4 : ndarray, shape (3, 3)
+    acceleration_second_moments_m2_s4 : ndarray, shape (3, 3)
         Mean products of the acceleration components in the segment.
     gap_edge_time_s : ndarray, shape (k,)
         Start and end of each IMU gap.
@@ -87,7 +87,7 @@ class Acceleration:
 
     time_s: Array
     acceleration_integral_m_s: Array
-    acceleration_products_m2_s4: Array
+    acceleration_second_moments_m2_s4: Array
     gap_edge_time_s: Array
     cumulative_gap_s: Array
 
@@ -99,7 +99,7 @@ class Acceleration:
 
     def compute_rms_m_s2(self, direction: Array) -> float:
         """Return the RMS acceleration (m/s²) along a unit vector in the segment."""
-        return float(np.sqrt(direction @ self.acceleration_products_m2_s4 @ direction))
+        return float(np.sqrt(direction @ self.acceleration_second_moments_m2_s4 @ direction))
 
 
 @dataclass(frozen=True)
@@ -351,7 +351,7 @@ def integrate_ned_acceleration(
                 for _, values in acceleration.items()
             ]
         ),
-        acceleration_products_m2_s4=segment_acceleration_m_s2.T
+        acceleration_second_moments_m2_s4=segment_acceleration_m_s2.T
         @ segment_acceleration_m_s2
         / len(segment_acceleration_m_s2),
         gap_edge_time_s=time_s[gap_edge_rows],
@@ -380,11 +380,13 @@ def compute_mean_step_acceleration(
     ):
         if component != 0.0:
             velocity_m_s += component * np.interp(step_edges_s, acceleration.time_s, integral_m_s)
-    gap_s = np.interp(step_edges_s, acceleration.gap_edge_time_s, acceleration.cumulative_gap_s)
+    cumulative_gap_at_edges_s = np.interp(
+        step_edges_s, acceleration.gap_edge_time_s, acceleration.cumulative_gap_s
+    )
     clipped_edges_s = np.clip(step_edges_s, acceleration.time_s[0], acceleration.time_s[-1])
     fraction_outside_imu_data = 1.0 - np.diff(clipped_edges_s) / step_s
     return np.diff(velocity_m_s) / step_s, np.clip(
-        np.diff(gap_s) / step_s + fraction_outside_imu_data, 0.0, 1.0
+        np.diff(cumulative_gap_at_edges_s) / step_s + fraction_outside_imu_data, 0.0, 1.0
     )
 
 

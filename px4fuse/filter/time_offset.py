@@ -15,10 +15,10 @@ from scipy.interpolate import CubicSpline
 from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array
-from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Record, Share, Span
+from px4fuse.core.record import NOT_IN_JSON, Count, NotInJson, NotNegative, Record, Share, Span
 from px4fuse.filter.fitting import NoiseParameters, fit_constant_errors, maximise_likelihood
 from px4fuse.filter.imu_motion import (
-    COARSE_MEASUREMENT_COUNT,
+    COARSE_SEARCH_MEASUREMENT_COUNT,
     HEADING_SIGMA_RAD,
     MAX_TESTED_TIME_OFFSET_S,
     MotionCache,
@@ -39,7 +39,7 @@ from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 INITIAL_SEARCH_HALF_WIDTH_S = 0.1
 # Half-width of the likelihood curve around the estimated time offset: this multiple of the
 # estimate's σ, but at least this time (s)
-CURVE_HALF_WIDTH_SIGMAS, MIN_CURVE_HALF_WIDTH_S = 3.5, 0.01
+LIKELIHOOD_CURVE_HALF_WIDTH_SIGMAS, MIN_LIKELIHOOD_CURVE_HALF_WIDTH_S = 3.5, 0.01
 # Width of the range of tested time offsets ÷ width of the likelihood curve. The curve is centred at
 # the maximum-likelihood estimate, which is not exactly in the middle of this range
 TESTED_TO_CURVE_WIDTH_RATIO = 1.3
@@ -71,7 +71,7 @@ MIN_TIME_OFFSET_S = 0.03
 # The effect of IMU noise on the time offset is simulated for groups of successive flight segments.
 # Minimum number of simulated groups (a short flight is simulated several times), and segments in
 # each group
-SIMULATED_GROUP_COUNT, SEGMENTS_PER_SIMULATED_GROUP = 96, 12
+SIMULATED_SEGMENT_GROUP_COUNT, FLIGHT_SEGMENTS_PER_SIMULATED_GROUP = 96, 12
 
 
 class PartOffset(Record):
@@ -102,7 +102,7 @@ class SourceTimeOffset(Record, kw_only=True):
         Clock drift of the source; None with fewer than three parts.
     change_p_value : float or None
         p-value of a constant offset; None with one part.
-    curve_time_offsets_s, curve_log_likelihood_drops : ndarray, shape (n,)
+    likelihood_curve_offsets_s, curve_log_likelihood_drops : ndarray, shape (n,)
         Tested time offsets, and decrease of the log-likelihood from its maximum.
     """
 
@@ -117,10 +117,10 @@ class SourceTimeOffset(Record, kw_only=True):
     change_p_value: Share | None = None
     parts: tuple[PartOffset, ...]
     count: Count
-    curve_time_offsets_s: NotWritten[Array] = NOT_WRITTEN
-    curve_log_likelihood_drops: NotWritten[Array] = NOT_WRITTEN
-    sigma_a_m_s2: NotWritten[float] = NOT_WRITTEN
-    sigma_z_m: NotWritten[float] = NOT_WRITTEN
+    likelihood_curve_offsets_s: NotInJson[Array] = NOT_IN_JSON
+    curve_log_likelihood_drops: NotInJson[Array] = NOT_IN_JSON
+    sigma_a_m_s2: NotInJson[float] = NOT_IN_JSON
+    sigma_z_m: NotInJson[float] = NOT_IN_JSON
 
     @property
     def remaining_s(self) -> float:
@@ -190,11 +190,11 @@ def estimate_time_offset(
     if isinstance(imu_motion, Unavailable):
         return imu_motion
     progress("time offset")
-    coarse_motion = imu_motion.downsample(COARSE_MEASUREMENT_COUNT)
+    downsampled_motion = imu_motion.downsample(COARSE_SEARCH_MEASUREMENT_COUNT)
     offset_s, _ = imu_motion.search_offset(noise_parameters)
     offset_sigma_s = 0.0
     search_half_width_s = INITIAL_SEARCH_HALF_WIDTH_S
-    for motion in (coarse_motion, imu_motion):
+    for motion in (downsampled_motion, imu_motion):
         noise_parameters = maximise_likelihood(
             [motion.make_positions_at_offset(offset_s)],
             noise_parameters,
@@ -208,28 +208,30 @@ def estimate_time_offset(
             motion.measurement_weights,
         ).compute_scores()[0]
         offset_s, offset_sigma_s = _fit_minimum_and_sigma(tested_offsets_s, scores)
-        curve_half_width_s = max(CURVE_HALF_WIDTH_SIGMAS * offset_sigma_s, MIN_CURVE_HALF_WIDTH_S)
-        search_half_width_s = TESTED_TO_CURVE_WIDTH_RATIO * curve_half_width_s
+        likelihood_curve_half_width_s = max(
+            LIKELIHOOD_CURVE_HALF_WIDTH_SIGMAS * offset_sigma_s, MIN_LIKELIHOOD_CURVE_HALF_WIDTH_S
+        )
+        search_half_width_s = TESTED_TO_CURVE_WIDTH_RATIO * likelihood_curve_half_width_s
     offset_variance_factor = _simulate_variance_increase_by_imu_noise(
         imu_motion, offset_s, noise_parameters, offset_sigma_s**-2.0
     )
-    curve_time_offsets_s, profile_scores, interval_low_s, interval_high_s = (
+    likelihood_curve_offsets_s, profile_scores, interval_low_s, interval_high_s = (
         _compute_offset_likelihood_curve(
             imu_motion,
             noise_parameters,
             (tested_offsets_s, scores),
             offset_s,
-            curve_half_width_s,
+            likelihood_curve_half_width_s,
             MAX_LOG_LIKELIHOOD_DROP * offset_variance_factor,
         )
     )
     has_both_interval_ends = interval_low_s is not None and interval_high_s is not None
-    offset_s = _fit_minimum_and_sigma(curve_time_offsets_s, profile_scores)[0]
+    offset_s = _fit_minimum_and_sigma(likelihood_curve_offsets_s, profile_scores)[0]
     # IMU samples are averages, so the timing error (half a sample interval, 1 σ) is added
     resolution_s = 0.5 * imu_motion.imu_interval_s
     interval_limits_s = (
-        curve_time_offsets_s[0] if interval_low_s is None else interval_low_s,
-        curve_time_offsets_s[-1] if interval_high_s is None else interval_high_s,
+        likelihood_curve_offsets_s[0] if interval_low_s is None else interval_low_s,
+        likelihood_curve_offsets_s[-1] if interval_high_s is None else interval_high_s,
     )
     interval_half_widths_s = np.hypot(np.array(interval_limits_s) - offset_s, 1.96 * resolution_s)
     interval_low_s = float(offset_s - interval_half_widths_s[0])
@@ -260,7 +262,7 @@ def estimate_time_offset(
         sigma_s=float(np.hypot(offset_sigma_s * np.sqrt(offset_variance_factor), resolution_s)),
         is_determinable=not rejection_reason,
         reason=rejection_reason,
-        curve_time_offsets_s=applied_offset_s + curve_time_offsets_s,
+        likelihood_curve_offsets_s=applied_offset_s + likelihood_curve_offsets_s,
         curve_log_likelihood_drops=profile_scores - profile_scores.min(),
         parts=parts,
         drift_ppm=drift_ppm,
@@ -288,12 +290,12 @@ def _compute_offset_likelihood_curve(
     """
     tested_offsets_s, tested_scores = tested_offsets_and_scores
     while True:
-        curve_time_offsets_s = _make_offset_grid(
+        likelihood_curve_offsets_s = _make_offset_grid(
             offset_s, half_width_s, LIKELIHOOD_CURVE_POINT_COUNT
         )
         if (
-            curve_time_offsets_s[0] < tested_offsets_s[0]
-            or curve_time_offsets_s[-1] > tested_offsets_s[-1]
+            likelihood_curve_offsets_s[0] < tested_offsets_s[0]
+            or likelihood_curve_offsets_s[-1] > tested_offsets_s[-1]
             or tested_offsets_s[1] - tested_offsets_s[0] > MAX_INTERPOLATED_OFFSET_STEP_S
         ):
             tested_offsets_s = _make_offset_grid(offset_s, half_width_s, FINE_GRID_OFFSET_COUNT)
@@ -302,15 +304,15 @@ def _compute_offset_likelihood_curve(
                 noise_parameters,
                 motion.measurement_weights,
             ).compute_scores()[0]
-        profile_scores = CubicSpline(tested_offsets_s, tested_scores)(curve_time_offsets_s)
+        profile_scores = CubicSpline(tested_offsets_s, tested_scores)(likelihood_curve_offsets_s)
         interval_low_s, interval_high_s = compute_profile_likelihood_interval(
-            curve_time_offsets_s, profile_scores, max_score_increase
+            likelihood_curve_offsets_s, profile_scores, max_score_increase
         )
         if (
             None not in (interval_low_s, interval_high_s)
             or half_width_s >= 2.0 * MAX_TESTED_TIME_OFFSET_S
         ):
-            return curve_time_offsets_s, profile_scores, interval_low_s, interval_high_s
+            return likelihood_curve_offsets_s, profile_scores, interval_low_s, interval_high_s
         half_width_s *= 2.0
 
 
@@ -340,9 +342,9 @@ def _simulate_variance_increase_by_imu_noise(
     interval_count_within_segments = int(np.count_nonzero(is_within_segment))
     rng = np.random.default_rng(measurement_count)
     first_segment_of_each_group = np.arange(
-        0, len(imu_motion.segment_motions), SEGMENTS_PER_SIMULATED_GROUP
+        0, len(imu_motion.segment_motions), FLIGHT_SEGMENTS_PER_SIMULATED_GROUP
     )
-    noise_series_count = -(-SIMULATED_GROUP_COUNT // len(first_segment_of_each_group))
+    noise_series_count = -(-SIMULATED_SEGMENT_GROUP_COUNT // len(first_segment_of_each_group))
 
     def draw_normal(count: int) -> Array:
         return rng.standard_normal((count, axis_count, noise_series_count)).transpose(1, 2, 0)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from px4fuse.core.arrays import Array, BoolArray
-from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, OrUnavailable, Record
+from px4fuse.core.record import NOT_IN_JSON, Count, NotInJson, NotNegative, OrUnavailable, Record
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.fitting import (
     SIGMA_A_SEARCH_RANGE_M_S2,
@@ -131,9 +131,9 @@ class AxisTuning(Record, kw_only=True):
     outliers: Count
     held_out: OrUnavailable[HeldOutCheck]
     biases_fitted: bool
-    name: NotWritten[str] = NOT_WRITTEN
-    outlier_time_s: NotWritten[Array] = NOT_WRITTEN
-    noises: NotWritten[NoiseParameters] = NOT_WRITTEN
+    name: NotInJson[str] = NOT_IN_JSON
+    outlier_time_s: NotInJson[Array] = NOT_IN_JSON
+    noises: NotInJson[NoiseParameters] = NOT_IN_JSON
 
     @property
     def sigma_a(self) -> NoiseEstimate:
@@ -223,14 +223,14 @@ def tune_axes(
         -len(preintegrated_motions[0].measurement_m) :
     ]
     axes = tuple(axis.keep_rows(make_downsampling_slice(axis.measurement_time_s)) for axis in axes)
-    axis_positions = [
+    positions_by_axis = [
         convert_to_positions_and_increments(preintegrate(axis, settings)) for axis in axes
     ]
-    measurement_count = len(axis_positions[0].measurement_m) - 1
+    measurement_count = len(positions_by_axis[0].measurement_m) - 1
     if measurement_count < MIN_MEASUREMENTS:
         return report_too_few_measurements(analysis_name, measurement_count, MIN_MEASUREMENTS)
     current_parameters = NoiseParameters(settings.sigma_a_m_s2, settings.sigma_z_m)
-    kf_fit = maximise_likelihood(axis_positions, current_parameters, np.ones(measurement_count))
+    kf_fit = maximise_likelihood(positions_by_axis, current_parameters, np.ones(measurement_count))
     # The estimate with biases, tilt and time offset needs IMU data
     imu_motion_fit = None
     if flight is not None and settings.input == "imu":
@@ -329,7 +329,7 @@ def _estimate_noises(fit: NoiseFit) -> tuple[NoiseEstimate, NoiseEstimate]:
         ),
         (log_sigma_z, log_sigma_a),
         SIGMA_Z_SEARCH_RANGE_M,
-        fit.log_sigma_z_variance_factor,
+        fit.variance_factor_of_ln_sigma_z,
     )
 
 
@@ -391,7 +391,7 @@ def _test_noises_on_second_half(
         )
     # One more position than measurements, because the first position is KF's initial state
     first_half_positions = [
-        positions.first(1 + first_half_count) for positions in fit.score.axis_positions
+        positions.first(1 + first_half_count) for positions in fit.score.positions_by_axis
     ]
     first_half_fit = maximise_likelihood(
         first_half_positions,

@@ -69,7 +69,7 @@ def rerun_refutes_cause(analysis: Analysis, filter_name: FilterName, cause: Reru
 def format_change(analysis: Analysis, cause: Rerun) -> str:
     """Format the changes of a re-run: "SIGMA_Z 0.1 m instead of 0.05 m"."""
     changed = select_changed_settings(cause.change, _find_used_settings(analysis))
-    names = changed.keys() - rerun_effects.SECONDARY_CHANGE_KEYS or changed
+    names = changed.keys() - rerun_effects.CHANGE_KEYS_WITHOUT_EFFECT_ALONE or changed
     texts = (_format_one_change(analysis, cause, name) for name in changed if name in names)
     return " and ".join(texts)
 
@@ -79,7 +79,7 @@ def _find_used_settings(analysis: Analysis) -> Mapping[str, float]:
     return {} if isinstance(ekf2_model, Unavailable) else ekf2_model.inputs.settings
 
 
-def describe_explained_part(cause: Rerun, statistic: Statistic) -> str:
+def describe_part_explained_by_change(cause: Rerun, statistic: Statistic) -> str:
     """Describe the part of a wrong mean NIS, mean NEES or difference that a change explains."""
     if makes_overconfident(cause, statistic):
         return "makes σ too small"

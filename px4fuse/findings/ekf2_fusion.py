@@ -67,7 +67,7 @@ MIN_GAP_ERROR_TO_HEIGHT_RMSE_RATIO = 3.0
 # Aiding sources whose vertical innovations EKF2 tests to flag a bad vertical acceleration
 AIDS_OF_VERTICAL_ACCELERATION_TEST = ("gnss_vel", "gnss_hgt", "baro_hgt")
 # Severity "note" if the flag fs_bad_acc_vertical is set for at most this fraction of the time
-MAX_BAD_ACCELERATION_FRACTION_FOR_NOTE = 0.3
+MAX_FLAGGED_TIME_FRACTION_FOR_SEVERITY_NOTE = 0.3
 # Action for each sensor that EKF2 does not fuse, by the PX4 parameter that enables its fusion
 ACTION_BY_SWITCH = {
     "EKF2_BARO_CTRL": "Shield the barometer from propeller wash and light.",
@@ -276,7 +276,7 @@ def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -
     flagged_fraction = float(is_flagged_bad.mean())
     start_s = float(state_times_s[is_flagged_bad.argmax()])
     yield finding(
-        "warning" if flagged_fraction > MAX_BAD_ACCELERATION_FRACTION_FOR_NOTE else "note",
+        "warning" if flagged_fraction > MAX_FLAGGED_TIME_FRACTION_FOR_SEVERITY_NOTE else "note",
         "ekf2_acceleration_bad",
         f"EKF2 flags its vertical acceleration as bad for {format_percent(flagged_fraction)} of "
         f"the time, first at {start_s:.0f} s. Barometer and GNSS both measure a larger height than "
@@ -288,14 +288,14 @@ def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -
 
 def detect_aid_faults(
     aids: Mapping[str, AidResult],
-    source_aid: str = "",
+    kf_position_aid: str = "",
     take_off_times_s: Sequence[float] = (),
     height_error_m: float | None = None,
 ) -> Findings:
     """Detect faults of EKF2's aiding sources.
 
-    ``source_aid`` is the aiding source that also gives KF's positions. ``height_error_m`` is EKF2's
-    height error in a barometer gap.
+    ``kf_position_aid`` is the aiding source that also gives KF's positions. ``height_error_m`` is
+    EKF2's height error in a barometer gap.
     """
     aids_to_test = {name: aid for name, aid in aids.items() if name not in AIDS_TESTED_BY_REPLAY}
     unfused_aids_by_switch: dict[str, list[AidResult]] = {}
@@ -307,12 +307,14 @@ def detect_aid_faults(
         if aid.verdict == "not_fused" and not is_take_off_gap:
             unfused_aids_by_switch.setdefault(AIDS[name].switch or name, []).append(aid)
     for fusion_parameter, aids_of_sensor in unfused_aids_by_switch.items():
-        yield _make_not_fused_finding(fusion_parameter, aids_of_sensor, source_aid, height_error_m)
+        yield _make_not_fused_finding(
+            fusion_parameter, aids_of_sensor, kf_position_aid, height_error_m
+        )
     for name, aid in aids_to_test.items():
-        sensor_cause = _find_source_sensor_cause(AIDS[name].switch, source_aid)
+        sensor_cause = _find_shared_sensor_cause(AIDS[name].switch, kf_position_aid)
         if not sensor_cause and any(result.change for result in aid.axes.values()):
             yield _make_innovation_change_finding(name, aid)
-        elif aid.verdict == "overconfident" and name != source_aid:
+        elif aid.verdict == "overconfident" and name != kf_position_aid:
             yield _make_overconfident_finding(name, aid, sensor_cause)
         elif aid.verdict == "biased":
             yield _make_innovation_bias_finding(name, aid)
@@ -321,7 +323,7 @@ def detect_aid_faults(
 def _make_not_fused_finding(
     fusion_parameter: str,
     aids_of_sensor: list[AidResult],
-    source_aid: str,
+    kf_position_aid: str,
     height_error_m: float | None,
 ) -> Finding:
     aid_with_longest_gap = max(aids_of_sensor, key=lambda aid: aid.longest_gap_duration_s)
@@ -342,7 +344,7 @@ def _make_not_fused_finding(
             "aid": aid_labels_text,
             "longest_gap_s": aid_with_longest_gap.longest_gap_duration_s,
             "rejected_fraction": aid_with_longest_gap.rejected_fraction,
-            CAUSE_KEY: _find_source_sensor_cause(fusion_parameter, source_aid)
+            CAUSE_KEY: _find_shared_sensor_cause(fusion_parameter, kf_position_aid)
             or (INNOVATION_CHANGE_CAUSE if has_innovation_shift else ""),
         },
         (aid_with_longest_gap.longest_gap_s,),
@@ -424,6 +426,10 @@ def _format_aid_label(aid: AidResult) -> str:
     return f"the {aid.label}" if aid.label in (BAROMETER.label, MAG.label) else aid.label
 
 
-def _find_source_sensor_cause(fusion_parameter: str, source_aid: str) -> str:
+def _find_shared_sensor_cause(fusion_parameter: str, kf_position_aid: str) -> str:
     """Return SOURCE_SENSOR_CAUSE if the parameter enables the sensor of KF's positions, else ""."""
-    return SOURCE_SENSOR_CAUSE if source_aid and AIDS[source_aid].switch == fusion_parameter else ""
+    return (
+        SOURCE_SENSOR_CAUSE
+        if kf_position_aid and AIDS[kf_position_aid].switch == fusion_parameter
+        else ""
+    )

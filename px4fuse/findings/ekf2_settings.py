@@ -69,8 +69,8 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
     inputs = analysis.ekf2_model.inputs
     used_noise_m, estimated_noise_m = find_used_noise_m(inputs), rerun.change[aid.noise]
     # EKF2 uses the larger of reported σ and noise parameter
-    parameter_noise_m = inputs.settings[aid.noise]
-    uses_reported_sigma = used_noise_m > parameter_noise_m
+    noise_setting_m = inputs.settings[aid.noise]
+    uses_reported_sigma = used_noise_m > noise_setting_m
     ratio = estimated_noise_m / used_noise_m
     factor, size_word, reason = ratio, "small", "EKF2's gain is too large."
     if ratio < 1.0:
@@ -100,7 +100,7 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
         mode_text = f" ({aid.noise_mode_parameter} 0)" if aid.noise_mode_parameter else ""
         message += (
             f" EKF2 uses the σ that {sensor_name} reports{mode_text}, because this σ is larger "
-            f"than {aid.noise} ({parameter_noise_m:g} m)."
+            f"than {aid.noise} ({noise_setting_m:g} m)."
         )
         action += f" Or let the position source report a variance of {estimated_noise_m**2:.2g} m²."
     if analysis.source.origin.is_gnss and math.isclose(

@@ -78,7 +78,7 @@ def detect(analysis: Analysis) -> Findings:
     yield from detect_instance_switches(ekf2, analysis.segment.whole_flight)
     median_imu_at_rest = measure_imu_at_rest(analysis.flight)
     if not isinstance(ekf2.record, Unavailable):
-        bias_states = cut_to_segment(ekf2.record.delayed, analysis.segment)
+        bias_states = cut_to_segment(ekf2.record.delayed_state, analysis.segment)
         if len(bias_states):
             yield from _detect_bias_at_limit(analysis, ekf2, bias_states, median_imu_at_rest)
             yield from _detect_gyro_bias(bias_states, median_imu_at_rest)
@@ -110,13 +110,13 @@ def _detect_bias_at_limit(
         limit = ekf2.parameters.get(parameter, 0.0)
         fractions = (bias_states[columns].abs() >= MIN_BIAS_TO_LIMIT_RATIO * limit).mean()
         axis_index = int(np.argmax(fractions))
-        limited_fraction = float(fractions.iloc[axis_index])
-        if limit <= 0.0 or limited_fraction < MIN_TIME_AT_LIMIT_FRACTION:
+        time_at_limit_fraction = float(fractions.iloc[axis_index])
+        if limit <= 0.0 or time_at_limit_fraction < MIN_TIME_AT_LIMIT_FRACTION:
             continue
         median_bias = float(bias_states[columns[axis_index]].median())
         message = (
             f"EKF2's {sensor} bias is at its limit {parameter} {limit:.3g} {unit} for "
-            f"{format_percent(limited_fraction)} of the flight. The bias estimate is "
+            f"{format_percent(time_at_limit_fraction)} of the flight. The bias estimate is "
             f"{median_bias:+.3g} {unit} {BODY_AXES[axis_index]}."
         )
         if sensor == "accelerometer" and median_imu_at_rest is not None:
@@ -131,7 +131,7 @@ def _detect_bias_at_limit(
             "ekf2_bias_at_limit",
             message + (_describe_height_error(analysis, ekf2) if axis_index == 2 else ""),
             f"Calibrate the {sensor}s at the temperature of the flight.",
-            {"bias": median_bias, "limit": limit, "limited_fraction": limited_fraction},
+            {"bias": median_bias, "limit": limit, "limited_fraction": time_at_limit_fraction},
         )
 
 

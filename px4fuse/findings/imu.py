@@ -23,7 +23,7 @@ from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, sample_rate
 MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2 = 343.0
 MIN_IMPLAUSIBLE_FORCE_SAMPLES = 3
 # Minimum accelerometer bias (m/s²) for severity "error"; it causes an error of 0.15 m in 1 s
-MIN_BIAS_FOR_ERROR_M_S2 = 0.3
+MIN_SEVERE_BIAS_M_S2 = 0.3
 # Tilt error (°) that has the same effect as an accelerometer bias of 1 m/s²
 TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))
 # Minimum time (s) without IMU samples for a finding: two prediction steps of KF
@@ -78,7 +78,7 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
     """Detect an accelerometer bias, estimated from the positions or by EKF2."""
     systematic_errors = analysis.systematic_errors
     ekf2_bias_m_s2 = _find_ekf2_accelerometer_bias(analysis)
-    sensor_text, min_bias_for_error_m_s2 = "accelerometers", MIN_BIAS_FOR_ERROR_M_S2
+    sensor_text, min_severe_bias_m_s2 = "accelerometers", MIN_SEVERE_BIAS_M_S2
     evidence = dict[str, float]()
     if isinstance(systematic_errors, SystematicErrors) and systematic_errors.has_significant_bias():
         horizontal_bias = systematic_errors.compute_horizontal_bias()
@@ -99,14 +99,14 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
     elif ekf2_bias_m_s2 is not None:
         # A horizontal bias that was estimated from the positions is not significant: test only the
         # vertical bias
-        is_horizontal_known = isinstance(systematic_errors, SystematicErrors)
-        bias_m_s2 = float(np.linalg.norm(ekf2_bias_m_s2[2 * is_horizontal_known :]))
+        is_horizontal_bias_estimated = isinstance(systematic_errors, SystematicErrors)
+        bias_m_s2 = float(np.linalg.norm(ekf2_bias_m_s2[2 * is_horizontal_bias_estimated :]))
         forward, right, down = ekf2_bias_m_s2
         message = (
             f"EKF2 estimates an accelerometer bias of {bias_m_s2:.2f} m/s²: {forward:+.2f} "
             f"forward, {right:+.2f} right and {down:+.2f} down."
         )
-        min_bias_for_error_m_s2 = np.inf  # a bias that EKF2 estimates does not affect EKF2
+        min_severe_bias_m_s2 = np.inf  # a bias that EKF2 estimates does not affect EKF2
     else:
         error_m_s2 = 0.0
         if (result := analysis.axes.get("down")) is not None:
@@ -119,7 +119,7 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
         )
     if bias_m_s2 >= MIN_BIAS_M_S2:
         yield finding(
-            "error" if bias_m_s2 >= min_bias_for_error_m_s2 else "warning",
+            "error" if bias_m_s2 >= min_severe_bias_m_s2 else "warning",
             "accelerometer_bias",
             f"{message} KF does not estimate biases.",
             f"Calibrate the {sensor_text} at the temperature of the flight.",

@@ -64,7 +64,7 @@ WRONG_CONVENTION_KEY = "convention"
 RESET_TIME_KEY = "reset_at_s"
 # A finding with one of these ids is the cause of other findings only if its severity is warning or
 # error, not note
-CAUSES_UNLESS_NOTE = ("ekf2_not_aligned", "parameter_changed")
+CAUSES_ONLY_ABOVE_SEVERITY_NOTE = ("ekf2_not_aligned", "parameter_changed")
 # A finding that another finding causes normally gets the action of that other finding. Findings
 # with these ids keep their own action, because it also corrects the cause
 EFFECTS_WITH_OWN_ACTION = ("ekf2_ev_delay_wrong",)
@@ -183,7 +183,7 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         cause_group = next((group for group in groups if group[0].id == cause), None)
         if (
             cause_group is None
-            or (cause_group[0].severity == "note" and cause in CAUSES_UNLESS_NOTE)
+            or (cause_group[0].severity == "note" and cause in CAUSES_ONLY_ABOVE_SEVERITY_NOTE)
             or WHITE_TO_ASSUMED_NOISE_RATIO_KEY in cause_group[0].evidence
         ):
             continue

@@ -10,7 +10,7 @@ from msgspec import structs
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.changes import MIN_RERUN_SIGMA_Z_M, SIGMA_A, SIGMA_Z, find_axis_tuning
-from px4fuse.comparison.estimates import find_first_tuning
+from px4fuse.comparison.estimates import find_first_available_tuning
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import find_aid, format_changes, make_noise_change
@@ -107,7 +107,7 @@ def detect(analysis: Analysis) -> Findings:
 
 def detect_wrong_settings(analysis: Analysis) -> Findings:
     """Detect a SIGMA_A or SIGMA_Z that differs significantly from its estimate."""
-    axis_tuning = find_first_tuning(analysis.tuning, HORIZONTAL, "aisle", "down")
+    axis_tuning = find_first_available_tuning(analysis.tuning, HORIZONTAL, "aisle", "down")
     if axis_tuning is None:
         return
     noise_estimates = {SIGMA_Z: axis_tuning.sigma_z, SIGMA_A: axis_tuning.sigma_a_two_state}
@@ -344,7 +344,7 @@ def _find_reported_noise_m(analysis: Analysis) -> float:
 
 def _format_action_for_excessive_noise(analysis: Analysis) -> str:
     name = find_aid(analysis).noise
-    parameter_noise_m = analysis.flight.log.parameters.get(name, np.nan)
+    noise_setting_m = analysis.flight.log.parameters.get(name, np.nan)
     reported_noise_m = _find_reported_noise_m(analysis)
     noise_m, noise_label = reported_noise_m, "noise that the receiver reports"
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
@@ -353,10 +353,10 @@ def _format_action_for_excessive_noise(analysis: Analysis) -> str:
         if estimated_noise_m > reported_noise_m:
             noise_m, noise_label = estimated_noise_m, "estimated noise"
     # `not >` instead of `<=`: an unknown parameter (NaN) gives no action
-    if not parameter_noise_m > MAX_RATIO_OF_EQUAL_NOISES * noise_m:
+    if not noise_setting_m > MAX_RATIO_OF_EQUAL_NOISES * noise_m:
         return ""
     return (
-        f"{name} is {parameter_noise_m:g} m, but the {noise_label} is {noise_m:.2g} m. Test this "
+        f"{name} is {noise_setting_m:g} m, but the {noise_label} is {noise_m:.2g} m. Test this "
         "smaller noise by a replay: px4fuse whatif LOG."
     )
 
@@ -438,8 +438,8 @@ def _find_sigma_action_without_replay(
             "Check the time offset (px4fuse sync LOG) and the IMU (gaps, vibration)."
         )
     parameters, reported_noise_m = analysis.flight.log.parameters, 0.0
-    parameter_noise_m = parameters.get(aid.noise, np.inf)
-    if used_noise_m > MIN_USED_TO_PARAMETER_NOISE_RATIO * parameter_noise_m:
+    noise_setting_m = parameters.get(aid.noise, np.inf)
+    if used_noise_m > MIN_USED_TO_PARAMETER_NOISE_RATIO * noise_setting_m:
         reported_noise_m = used_noise_m
     noise_change = make_noise_change(aid, parameters, reported_noise_m, noise_m)
     changes = {name: value for name, value in noise_change.items() if value != parameters.get(name)}

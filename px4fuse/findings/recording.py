@@ -17,7 +17,7 @@ DEFAULT_SDLOG_PROFILE, VISION_PROFILE_MASK = 1, 128
 def detect(analysis: Analysis) -> Findings:
     yield from detect_dropouts(analysis)
     yield from detect_lost_data(analysis.flight)
-    yield from detect_decreasing_clocks(analysis.flight)
+    yield from detect_backward_clock_jumps(analysis.flight)
     yield from detect_other_estimators(analysis)
     yield from detect_unavailable_data(analysis)
     yield from detect_source_not_logged(analysis)
@@ -76,7 +76,7 @@ def detect_lost_data(flight: Flight) -> Findings:
         )
 
 
-def detect_decreasing_clocks(flight: Flight) -> Findings:
+def detect_backward_clock_jumps(flight: Flight) -> Findings:
     """Detect a boot clock (restart of the autopilot) or receive times that jump back."""
     log = flight.log
     if log.restarts:

@@ -154,7 +154,7 @@ def detect_wrong_delay(analysis: Analysis, time_offset: SourceTimeOffset) -> Fin
         or (is_gnss and time_offset.is_significant(time_offset.remaining_s))
     ):
         return
-    estimated_delay_ms = remedy.estimate_differing_delay_ms(analysis, time_offset, delay_ms)
+    estimated_delay_ms = remedy.estimate_delay_if_not_as_logged_ms(analysis, time_offset, delay_ms)
     if estimated_delay_ms is None:
         return
     low_ms, high_ms = (

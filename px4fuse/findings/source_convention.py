@@ -70,17 +70,19 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
     """
     faults = analysis.convention_faults
     cause_findings = [item for item in findings if WRONG_CONVENTION_KEY in item.evidence]
-    unusable_findings = [
+    findings_of_unusable_positions = [
         item for item in findings if FINDING_CATALOGUE[item.id].report_class == "unusable"
     ]
-    if unusable_findings:
+    if findings_of_unusable_positions:
         # A lever arm does not change the heading of the orientation
-        is_orientation_kept = {item.id for item in unusable_findings} == {"source_lever_arm"}
+        has_only_lever_arm_finding = {item.id for item in findings_of_unusable_positions} == {
+            "source_lever_arm"
+        }
         cause_findings = [
             item
             for item in cause_findings
-            if is_orientation_kept and item.id == "source_orientation_wrong"
-        ] + unusable_findings
+            if has_only_lever_arm_finding and item.id == "source_orientation_wrong"
+        ] + findings_of_unusable_positions
         findings = [
             item
             for item in findings
@@ -109,7 +111,7 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
         # a drifting clock has no constant time offset
         and not (faults.clock_drift and item.id == "source_time_offset")
     ]
-    if faults.is_ambiguous and not unusable_findings:
+    if faults.is_ambiguous and not findings_of_unusable_positions:
         return [
             *cause_findings,
             *(

@@ -72,7 +72,7 @@ MIN_SCALE_ERROR_AGAINST_TRUTH = 0.08
 MIN_JITTER_FOR_ERROR_S = 0.03
 # Minimum amplitude (m) of a periodic error for severity "error": twice the noise of a good UWB
 # system
-MIN_AMPLITUDE_FOR_ERROR_M = 0.2
+MIN_SEVERE_PERIODIC_ERROR_M = 0.2
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -180,35 +180,51 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
     )
     if len(axis_noises) < 2:
         return
-    (small_m, _, small_high_m, small_axis), (large_m, large_low_m, _, large_axis) = axis_noises
-    if large_m < MIN_AXIS_NOISE_RATIO * small_m or large_low_m <= small_high_m:
+    (
+        (quiet_sigma_m, _, quiet_sigma_high_m, quiet_axis),
+        (noisy_sigma_m, noisy_sigma_low_m, _, noisy_axis),
+    ) = axis_noises
+    if (
+        noisy_sigma_m < MIN_AXIS_NOISE_RATIO * quiet_sigma_m
+        or noisy_sigma_low_m <= quiet_sigma_high_m
+    ):
         return
     action = f"{find_source_texts(analysis.source).slow_error_check}."
-    evidence = {"smaller_noise_sigma_z_m": small_m, "larger_noise_sigma_z_m": large_m}
-    if large_axis in analysis.axes:
-        action += f" Analyse each axis separately (--axis {large_axis} --sigma-z {large_m:.2g})."
-        evidence = {f"{small_axis}_sigma_z_m": small_m, f"{large_axis}_sigma_z_m": large_m}
+    evidence = {"smaller_noise_sigma_z_m": quiet_sigma_m, "larger_noise_sigma_z_m": noisy_sigma_m}
+    if noisy_axis in analysis.axes:
+        action += (
+            f" Analyse each axis separately (--axis {noisy_axis} --sigma-z {noisy_sigma_m:.2g})."
+        )
+        evidence = {
+            f"{quiet_axis}_sigma_z_m": quiet_sigma_m,
+            f"{noisy_axis}_sigma_z_m": noisy_sigma_m,
+        }
     yield make_warning(
         "source_noise_unequal_axes",
-        f"{analysis.source.kind_name} noise is {large_m:.2g} m along {large_axis} and "
-        f"{small_m:.2g} m along {small_axis}. One measurement noise (SIGMA_Z, EKF2) does not fit "
-        "both axes.",
+        f"{analysis.source.kind_name} noise is {noisy_sigma_m:.2g} m along {noisy_axis} and "
+        f"{quiet_sigma_m:.2g} m along {quiet_axis}. One measurement noise (SIGMA_Z, EKF2) does not "
+        "fit both axes.",
         action,
         evidence,
     )
 
 
 def detect_noise_variation(analysis: Analysis) -> Findings:
-    noisy_part = analysis.noisy_part
+    noisy_flight_part = analysis.noisy_flight_part
     if (
-        noisy_part is None
-        or noisy_part.sigma_ratio < MIN_NOISY_PART_SIGMA_RATIO
+        noisy_flight_part is None
+        or noisy_flight_part.sigma_ratio < MIN_NOISY_PART_SIGMA_RATIO
         # An outlier also increases the next innovations, so the ratio is tested without outliers
         # too
-        or noisy_part.sigma_ratio_without_outliers < MIN_NOISY_PART_SIGMA_RATIO_WITHOUT_OUTLIERS
+        or noisy_flight_part.sigma_ratio_without_outliers
+        < MIN_NOISY_PART_SIGMA_RATIO_WITHOUT_OUTLIERS
     ):
         return
-    noise_ratio, start_s, end_s = noisy_part.sigma_ratio, noisy_part.start_s, noisy_part.end_s
+    noise_ratio, start_s, end_s = (
+        noisy_flight_part.sigma_ratio,
+        noisy_flight_part.start_s,
+        noisy_flight_part.end_s,
+    )
     yield (make_error if noise_ratio >= MIN_NOISY_PART_SIGMA_RATIO_FOR_ERROR else make_warning)(
         "source_noise_varies",
         f"{analysis.source.kind_name} noise is {noise_ratio:.1f} times larger from "
@@ -233,18 +249,18 @@ def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResi
             "or receiving.",
             {"jitter_s": jitter_s},
         )
-    speed_noise = find_speed_dependent_noise(local_residuals)
-    if speed_noise is not None:
+    noise_by_speed = find_speed_dependent_noise(local_residuals)
+    if noise_by_speed is not None:
         yield make_error(
             "source_noise_grows_with_speed",
             f"{analysis.source.kind_name} noise grows with speed: "
-            f"{format_metres(speed_noise.slow_m)} m at {speed_noise.slow_m_s:.1f} m/s and "
-            f"{format_metres(speed_noise.fast_m)} m at {speed_noise.fast_m_s:.1f} m/s (1 σ). The "
-            "noise perpendicular to the motion also grows, so time offset and jitter are not the "
-            "cause.",
+            f"{format_metres(noise_by_speed.slow_m)} m at {noise_by_speed.slow_m_s:.1f} m/s and "
+            f"{format_metres(noise_by_speed.fast_m)} m at {noise_by_speed.fast_m_s:.1f} m/s (1 σ). "
+            "The noise perpendicular to the motion also grows, so time offset and jitter are not "
+            "the cause.",
             "Send a variance that grows with speed (EKF2_EV_NOISE_MD 0). Shorten the exposure or "
             "ranging time.",
-            speed_noise._asdict(),
+            noise_by_speed._asdict(),
         )
 
 
@@ -253,7 +269,9 @@ def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: Err
     positions_text = analysis.source.positions_phrase
     if periodic_error is not None:
         yield (
-            make_error if periodic_error.amplitude_m >= MIN_AMPLITUDE_FOR_ERROR_M else make_warning
+            make_error
+            if periodic_error.amplitude_m >= MIN_SEVERE_PERIODIC_ERROR_M
+            else make_warning
         )(
             "source_error_periodic",
             f"The error of the {positions_text} is periodic: amplitude "
@@ -284,13 +302,13 @@ def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: Err
 
 def detect_scale_error(analysis: Analysis, error_fit: ErrorFit) -> Findings:
     if abs(error_fit.scale) >= max(
-        MIN_SCALE_ERROR_AGAINST_TRUTH, MIN_SCALE_ERROR_TO_SIGMA_RATIO * error_fit.scale_sigma
+        MIN_SCALE_ERROR_AGAINST_TRUTH, MIN_SCALE_ERROR_TO_SIGMA_RATIO * error_fit.scale_error_sigma
     ):
         yield make_scale_finding(
             analysis.source,
             error_fit.scale,
-            error_fit.scale_sigma,
-            f"ground truth (± {format_percent(1.96 * error_fit.scale_sigma, 1)}, 95 %)",
+            error_fit.scale_error_sigma,
+            f"ground truth (± {format_percent(1.96 * error_fit.scale_error_sigma, 1)}, 95 %)",
             f"{find_source_texts(analysis.source).scale_check}.",
         )
 

@@ -31,7 +31,7 @@ MIN_HEADING_ERROR_DEG = 5.0
 # Minimum yaw misalignment (°), for severity "error": 26 % of the motion appears on the other axis
 MIN_SEVERE_HEADING_ERROR_DEG = 15.0
 # Minimum ratio: EKF2's heading drift against ground truth ÷ drift against the position source
-MIN_TRUE_TO_RELATIVE_HEADING_DRIFT_RATIO = 0.5
+MIN_TRUE_TO_ESTIMATED_HEADING_DRIFT_RATIO = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 ALIGNED_VISION_TOPIC = "estimator_visual_odometry_aligned"
 CHECK_GNSS_DELAY_ACTION = "Check EKF2_GPS_DELAY: a wrong delay also causes a heading error."
@@ -151,8 +151,8 @@ def _truth_contradicts_heading_drift(flight: Flight, heading_error: HeadingError
         error_rad = heading_of(samples.to_numpy()) - heading_of(true_attitude)
         errors_rad.append(np.median(np.arctan2(np.sin(error_rad), np.cos(error_rad))))
     true_drift_deg = np.degrees(np.ptp(errors_rad))
-    relative_drift_deg = np.ptp([part.heading_error_deg for part in parts])
-    return bool(true_drift_deg < MIN_TRUE_TO_RELATIVE_HEADING_DRIFT_RATIO * relative_drift_deg)
+    estimated_drift_deg = np.ptp([part.heading_error_deg for part in parts])
+    return bool(true_drift_deg < MIN_TRUE_TO_ESTIMATED_HEADING_DRIFT_RATIO * estimated_drift_deg)
 
 
 def _make_heading_drift_finding(analysis: Analysis, heading_error: HeadingError) -> Finding:

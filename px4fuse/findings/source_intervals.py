@@ -34,14 +34,14 @@ MIN_INTERVAL_COUNT = 50
 MIN_MISSING_FRACTION_FOR_DOWNSAMPLING = 0.25
 # After downsampling, most intervals between positions have one of two lengths: n or n + 1 periods
 # of the source. Minimum fraction of intervals with these lengths
-MIN_FRACTION_OF_BOTH_INTERVAL_LENGTHS = 0.85
+MIN_FRACTION_OF_TWO_MOST_FREQUENT_INTERVALS = 0.85
 # Minimum fraction of intervals with the rarer of the two lengths n and n + 1 source periods
 MIN_FRACTION_OF_RARER_INTERVAL_LENGTH = 0.1
 # Maximum RMS deviation of intervals from whole multiples of the source period, divided by the
 # source period. Intervals with jitter have 0.03, random intervals 0.29
 MAX_ROUNDING_RMS_ERROR = 0.06
 # The tested source periods are the median interval ÷ n; maximum of n
-MAX_PERIODS_IN_MEDIAN_INTERVAL = 4
+MAX_SOURCE_PERIODS_PER_MEDIAN_INTERVAL = 4
 # Minimum duration (s) of a gap at the start or end of the flight: take-off and landing are detected
 # some seconds late
 MIN_GAP_AT_START_OR_END_S = 3.0
@@ -75,7 +75,7 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
         elif start_s != whole_flight.start_s and end_s != whole_flight.end_s:
             gaps.append((start_s, end_s))
         elif end_s - start_s > MIN_GAP_AT_START_OR_END_S:
-            yield _make_stop_or_begin_finding(analysis, (start_s, end_s), aids)
+            yield _make_source_stops_or_begins_finding(analysis, (start_s, end_s), aids)
     for finding_id, spans in (("source_gap_in_log", gaps_only_in_log), ("source_gap", gaps)):
         if not spans:
             continue
@@ -111,15 +111,17 @@ def _find_action_for_unlogged_positions(analysis: Analysis, start_s: float, end_
     return "Log fewer topics (SDLOG_PROFILE)."
 
 
-def _make_stop_or_begin_finding(analysis: Analysis, span_s: Span, fused_aids: list[Aid]) -> Finding:
+def _make_source_stops_or_begins_finding(
+    analysis: Analysis, span_s: Span, fused_aids: list[Aid]
+) -> Finding:
     (start_s, end_s), source = span_s, analysis.source
     duration_s, effect_sentence, action = end_s - start_s, "", ""
     if end_s == analysis.segment.whole_flight.end_s:
         finding_id, event, event_s = "source_stops", "stop", start_s
-        before_or_after, flight_edge = "after", "before the end"
+        before_or_after, start_or_end_text = "after", "before the end"
     else:
         finding_id, event, event_s = "source_begins", "begin", end_s
-        before_or_after, flight_edge = "before", "after the start"
+        before_or_after, start_or_end_text = "before", "after the start"
         action = "" if source.alignment else " Take off only when positions arrive."
     ekf2_errors_at_end = _find_ekf2_errors_at_end(analysis, span_s)
     for name, quantity in (("sigma_m", "reported σ"), ("error_m", "position error")):
@@ -137,7 +139,7 @@ def _make_stop_or_begin_finding(analysis: Analysis, span_s: Span, fused_aids: li
         "error" if is_dead_reckoning else "warning",
         finding_id,
         f"{source.positions_phrase} {event} in flight at {event_s:.1f} s, {duration_s:.1f} s "
-        f"{flight_edge} of the flight.{aiding_sentence}{effect_sentence}",
+        f"{start_or_end_text} of the flight.{aiding_sentence}{effect_sentence}",
         f"{find_source_texts(source).data_link_check} for the time {before_or_after} "
         f"{event_s:.1f} s.{action}",
         {"at_s": event_s, "duration_s": duration_s, **ekf2_errors_at_end},
@@ -264,13 +266,15 @@ def detect_downsampling(analysis: Analysis) -> Findings:
     period_s, multiples = period_and_multiples
     lost_fraction = 1.0 - 1.0 / float(np.mean(multiples))
     fraction_by_multiple = np.bincount(multiples.astype(np.intp)) / len(multiples)
-    fractions_of_pairs = fraction_by_multiple[:-1] + fraction_by_multiple[1:]
-    smaller_multiple = int(np.argmax(fractions_of_pairs))
-    fractions_of_pair = fraction_by_multiple[smaller_multiple : smaller_multiple + 2]
+    fraction_sums_of_neighbouring_multiples = fraction_by_multiple[:-1] + fraction_by_multiple[1:]
+    smaller_of_most_frequent_multiples = int(np.argmax(fraction_sums_of_neighbouring_multiples))
+    fractions_of_most_frequent_multiples = fraction_by_multiple[
+        smaller_of_most_frequent_multiples : smaller_of_most_frequent_multiples + 2
+    ]
     if (
         lost_fraction < MIN_MISSING_FRACTION_FOR_DOWNSAMPLING
-        or fractions_of_pair.sum() < MIN_FRACTION_OF_BOTH_INTERVAL_LENGTHS
-        or fractions_of_pair.min() < MIN_FRACTION_OF_RARER_INTERVAL_LENGTH
+        or fractions_of_most_frequent_multiples.sum() < MIN_FRACTION_OF_TWO_MOST_FREQUENT_INTERVALS
+        or fractions_of_most_frequent_multiples.min() < MIN_FRACTION_OF_RARER_INTERVAL_LENGTH
     ):
         return
     mean_interval_s = float(np.mean(intervals_s))
@@ -306,7 +310,7 @@ def _find_period(intervals_s: Array) -> tuple[float, Array] | None:
     """Return the period (s) of the source, and the number of periods in each interval."""
     # The upper median is one of the intervals; numpy.median may be the mean of two
     median_interval_s = float(np.sort(intervals_s)[len(intervals_s) // 2])
-    for median_count in range(1, MAX_PERIODS_IN_MEDIAN_INTERVAL + 1):
+    for median_count in range(1, MAX_SOURCE_PERIODS_PER_MEDIAN_INTERVAL + 1):
         multiples = np.rint(intervals_s * median_count / median_interval_s)
         if np.any(multiples < 1.0):
             continue

@@ -113,8 +113,8 @@ MIN_OUTLIERS = 3
 # Minimum fraction of positions with logged innovations, to state the number of rejected outliers
 MIN_LOGGED_POSITION_FRACTION = 0.75
 # Warning if the reported position variance is at least this factor too small or too large
-MIN_REPORTED_VARIANCE_FACTOR = 2.0
-MIN_REPORTED_VARIANCE_FACTOR_FOR_ERROR = 3.0
+MIN_VARIANCE_ERROR_FACTOR = 2.0
+MIN_VARIANCE_ERROR_FACTOR_FOR_SEVERITY_ERROR = 3.0
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -200,11 +200,11 @@ def detect_jumps(analysis: Analysis) -> Findings:
     source_texts = find_source_texts(analysis.source)
     cause = source_texts.jump_causes
     evidence = {"count": len(jumps), "size_m": size_m, "at_s": time_s, "sigma_m": sigma_m}
-    counter_time_s = min(
+    nearest_reset_counter_time_s = min(
         analysis.source.reset_times_s, key=lambda at_s: abs(at_s - time_s), default=np.inf
     )
-    if abs(counter_time_s - time_s) < MAX_JUMP_TO_RESET_COUNTER_TIME_S:
-        evidence[RESET_TIME_KEY] = float(counter_time_s)
+    if abs(nearest_reset_counter_time_s - time_s) < MAX_JUMP_TO_RESET_COUNTER_TIME_S:
+        evidence[RESET_TIME_KEY] = float(nearest_reset_counter_time_s)
         cause = "The source announced the jump (reset_counter): it relocalised or set a new origin."
     jump_text = f"jump by {size_m:.2f} m"
     if len(jumps) > 1:
@@ -231,16 +231,16 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
     coordinates = constant_coordinates(source)
     is_single_coordinate = len(coordinates) == 1
     if not (is_single_coordinate or is_height_only(source)) or (
-        is_single_coordinate and source.rounding_step_m > 0.0
+        is_single_coordinate and source.quantisation_step_m > 0.0
     ):
         return  # rounded positions may be constant in motion
     values_m = dict(zip("xyz", source.samples[Columns.POSITION].median().tolist(), strict=True))
     finding_id, make_finding = "source_coordinate_constant", make_error
-    mask_of_constant, mask_of_measured = EV_CTRL_HORIZONTAL_MASK, EV_CTRL_HEIGHT_MASK
+    constant_axes_bits, measured_axes_bits = EV_CTRL_HORIZONTAL_MASK, EV_CTRL_HEIGHT_MASK
     consequence = NO_ESTIMATES_SENTENCE
     if coordinates == ["z"]:
         finding_id, make_finding = "source_height_constant", make_warning
-        mask_of_constant, mask_of_measured = mask_of_measured, mask_of_constant
+        constant_axes_bits, measured_axes_bits = measured_axes_bits, constant_axes_bits
         consequence = "The height is not evaluated."
     elif coordinates == ["x", "y"]:
         make_finding = make_warning
@@ -249,8 +249,8 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
     if EV_POS.switch in parameters:
         value = int(parameters[EV_POS.switch])
         setting_action = f"Leave {EV_POS.switch} at {value}"
-        if value & mask_of_constant:
-            new_value = value & ~mask_of_constant | mask_of_measured
+        if value & constant_axes_bits:
+            new_value = value & ~constant_axes_bits | measured_axes_bits
             setting_action = f"Set {EV_POS.switch} to {new_value}"
         elif coordinates == ["z"]:
             make_finding = make_note
@@ -473,8 +473,8 @@ def _format_rejected_outliers(analysis: Analysis, outlier_time_s: Array) -> str:
     ):
         return ""
     rejection_times_s = innovations.index[innovations["rejected"] > 0.0].to_numpy()
-    distances_s = np.abs(rejection_times_s - outlier_time_s[:, None])
-    is_rejected = np.any(distances_s < 0.5 / analysis.source.compute_rate_hz(), axis=1)
+    time_differences_s = np.abs(rejection_times_s - outlier_time_s[:, None])
+    is_rejected = np.any(time_differences_s < 0.5 / analysis.source.compute_rate_hz(), axis=1)
     return f" EKF2's gate rejected {is_rejected.sum()} of the {len(is_rejected)} outliers."
 
 
@@ -499,8 +499,8 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
     # A reported variance near the mean square error against ground truth is correct
     rmse_m = _compute_rmse_per_axis_m(analysis) if variance_ratio > 1.0 else None
     if (
-        (rmse_m is not None and reported_sigma_m**2 < MIN_REPORTED_VARIANCE_FACTOR * rmse_m**2)
-        or error_factor < MIN_REPORTED_VARIANCE_FACTOR
+        (rmse_m is not None and reported_sigma_m**2 < MIN_VARIANCE_ERROR_FACTOR * rmse_m**2)
+        or error_factor < MIN_VARIANCE_ERROR_FACTOR
         or low <= reported_sigma_m <= high
     ):
         return
@@ -510,7 +510,7 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
             " The reported σ may include time-correlated errors, which innovations do not show."
         )
     severity: Severity = (
-        "error" if error_factor >= MIN_REPORTED_VARIANCE_FACTOR_FOR_ERROR else "warning"
+        "error" if error_factor >= MIN_VARIANCE_ERROR_FACTOR_FOR_SEVERITY_ERROR else "warning"
     )
     cause = REPORTED_VARIANCE_USED_BY_EKF2_CAUSE
     effect = "EKF2 uses the larger of reported variance and EKF2_EVP_NOISE² (EKF2_EV_NOISE_MD 0)."

@@ -42,7 +42,7 @@ MIN_DROPPED_POSITION_FRACTION = 0.02
 MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC = 10
 # Minimum fraction of timestamps of the expected kind: arrival times until TIMESYNC converges,
 # measurement times afterwards
-MIN_FRACTION_OF_TIMESTAMP_KIND = 0.95
+MIN_FRACTION_OF_EXPECTED_TIMESTAMP_KIND = 0.95
 # Minimum mean number of positions in a burst (positions that arrive together)
 MIN_BURST_POSITIONS = 2.5
 # Minimum number of pauses before bursts; fewer pauses count as gaps in the position source
@@ -193,7 +193,7 @@ def detect_arrival_timestamps(analysis: Analysis) -> Findings:
         )
     elif (
         np.mean(position_age_s.abs() < MAX_ARRIVAL_TO_PUBLICATION_DELAY_S)
-        >= MIN_FRACTION_OF_TIMESTAMP_KIND
+        >= MIN_FRACTION_OF_EXPECTED_TIMESTAMP_KIND
     ):
         yield make_warning(
             "source_timestamps_are_arrival_times",
@@ -210,7 +210,7 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
     if position_age_s is None or find_timesync_convergence(analysis) is not None:
         return
     sample_count = max(MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC, len(position_age_s) // 10)
-    start_age_s, end_age_s = (
+    initial_latency_s, final_latency_s = (
         float(age_s.median())
         for age_s in (position_age_s.iloc[:sample_count], position_age_s.iloc[-sample_count:])
     )
@@ -229,21 +229,25 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
         )
     is_any_dropped = dropped_fraction > MIN_DROPPED_POSITION_FRACTION
     if (
-        end_age_s - start_age_s < MIN_LATENCY_FOR_ERROR_S
+        final_latency_s - initial_latency_s < MIN_LATENCY_FOR_ERROR_S
         or correlation_with_time < MIN_LATENCY_CORRELATION
     ):
         if not is_any_dropped or dropped_fraction >= 1.0 - MIN_DROPPED_POSITION_FRACTION:
             return
         change_verb = "varies"
-        start_age_s, end_age_s = position_age_s.quantile([0.05, 0.95]).tolist()
+        initial_latency_s, final_latency_s = position_age_s.quantile([0.05, 0.95]).tolist()
     yield (make_error if is_any_dropped else make_warning)(
         "source_latency_varies",
         f"The latency of the {analysis.source.positions_phrase} {change_verb} in flight from "
-        f"{start_age_s:.2f} s to {end_age_s:.2f} s (time from measurement to arrival)."
+        f"{initial_latency_s:.2f} s to {final_latency_s:.2f} s (time from measurement to arrival)."
         f"{late_drop_sentence}",
         "Find the queue that fills up: sender, bridge or link. Send fewer or smaller messages, and "
         "let the sender drop old positions.",
-        {"start_s": start_age_s, "end_s": end_age_s, "dropped_fraction": dropped_fraction},
+        {
+            "start_s": initial_latency_s,
+            "end_s": final_latency_s,
+            "dropped_fraction": dropped_fraction,
+        },
     )
 
 
@@ -255,13 +259,15 @@ def find_timesync_convergence(analysis: Analysis) -> tuple[float, float] | None:
     is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_TO_PUBLICATION_DELAY_S).to_numpy()
     # TIMESYNC converged where most earlier and fewest later timestamps are arrival times
     converged_index = int(np.argmax(np.cumsum(np.where(is_arrival_time, 1, -1)))) + 1
-    is_arrival_before, is_arrival_after = np.split(is_arrival_time, [converged_index])
+    is_arrival_time_before_timesync, is_arrival_time_after_timesync = np.split(
+        is_arrival_time, [converged_index]
+    )
     if (
-        is_arrival_time.mean() >= MIN_FRACTION_OF_TIMESTAMP_KIND
-        or min(len(is_arrival_before), len(is_arrival_after))
+        is_arrival_time.mean() >= MIN_FRACTION_OF_EXPECTED_TIMESTAMP_KIND
+        or min(len(is_arrival_time_before_timesync), len(is_arrival_time_after_timesync))
         < MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC
-        or min(is_arrival_before.mean(), 1.0 - is_arrival_after.mean())
-        < MIN_FRACTION_OF_TIMESTAMP_KIND
+        or min(is_arrival_time_before_timesync.mean(), 1.0 - is_arrival_time_after_timesync.mean())
+        < MIN_FRACTION_OF_EXPECTED_TIMESTAMP_KIND
     ):
         return None
     latency_s = float(position_age_s.iloc[converged_index:].median())

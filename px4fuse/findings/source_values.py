@@ -32,9 +32,9 @@ from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
 
 # Rounding to smaller steps (m) is not reported: its errors are below the noise of UWB
-MIN_ROUNDING_STEP_M = 0.05
+MIN_QUANTISATION_STEP_M = 0.05
 # Maximum ratio of EKF2's position RMSE with the estimated lever arm to the RMSE without it
-MAX_LEVER_ARM_RMSE_RATIO = 0.7
+MAX_RMSE_RATIO_WITH_TO_WITHOUT_LEVER_ARM = 0.7
 # The finding on a wrong lever arm also states a rotation of the positions if the angle exceeds both
 # limits: degrees, and multiples of its σ
 MIN_ROTATION_DEG, MIN_ROTATION_SIGMAS = 5.0, 3.0
@@ -45,7 +45,7 @@ MIN_SENDER_DISTANCE_M = 0.1
 MIN_SENDER_DISTANCE_SIGMAS = 4.0
 # Window length (samples): short, because a lost sample swaps the senders of even and odd samples
 WINDOW_SAMPLES = 16
-MIN_WINDOWS_FOR_TWO_SENDERS = 10
+MIN_SAMPLE_WINDOWS_TO_DETECT_TWO_SENDERS = 10
 # Positions are copies of EKF2's estimate if the median distance (m) is below this limit
 MAX_DISTANCE_OF_COPY_M = 0.01
 # Fused positions are copies of EKF2's estimate if the median distance (m) is below this stricter
@@ -53,11 +53,11 @@ MAX_DISTANCE_OF_COPY_M = 0.01
 MAX_DISTANCE_OF_FUSED_COPY_M = 0.001
 # To find positions that are copies of EKF2's position, both are compared only above this speed
 # (m/s): at rest, a correct source agrees too
-MIN_SPEED_FOR_COPY_TEST_M_S = 0.2
+MIN_SPEED_TO_DETECT_COPIED_ESTIMATE_M_S = 0.2
 # Tested delays (s) of positions that are copies of EKF2's position
-TESTED_COPY_DELAYS_S = np.arange(0.0, 0.305, 0.005)
+TESTED_DELAYS_OF_COPIED_ESTIMATE_S = np.arange(0.0, 0.305, 0.005)
 # Approximate number of positions that are used to find this delay of copied positions
-COPY_DELAY_POSITIONS = 300
+POSITION_COUNT_TO_FIND_DELAY_OF_COPY = 300
 # Finding id, fault and action for each reason of an invalid position
 INVALID_POSITION_TEXTS: Mapping[str, tuple[str, str, str]] = {
     "zero": (
@@ -104,9 +104,11 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
         if end_s - start_s > compute_max_interval_s(1.0 / source.compute_rate_hz()):
             make_finding = make_warning
             # Last position before the span, and first position after it
-            valid_s = analysis.input_axes[0].measurement_time_s
-            first, last = np.clip(np.searchsorted(valid_s, (start_s, end_s)), 1, len(valid_s) - 1)
-            gap_span_s = float(valid_s[first - 1]), float(valid_s[last])
+            valid_times_s = analysis.input_axes[0].measurement_time_s
+            first, last = np.clip(
+                np.searchsorted(valid_times_s, (start_s, end_s)), 1, len(valid_times_s) - 1
+            )
+            gap_span_s = float(valid_times_s[first - 1]), float(valid_times_s[last])
             error_text = f" {describe_errors_after_gap(analysis, gap_span_s)}"
         yield make_finding(
             name,
@@ -125,8 +127,8 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
 
 def detect_rounding(analysis: Analysis) -> Findings:
     """Detect positions that are rounded to coarse steps."""
-    source, step_m = analysis.source, analysis.source.rounding_step_m
-    if step_m < MIN_ROUNDING_STEP_M:
+    source, step_m = analysis.source, analysis.source.quantisation_step_m
+    if step_m < MIN_QUANTISATION_STEP_M:
         return
     cause_text, action = "", "Send the positions with more digits."
     if np.log2(step_m) % 1.0 == 0.0:
@@ -158,7 +160,7 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     lever_arm_m = np.add(source.lever_arm_m[:2], lever_arm[:2]).round(2) + 0.0
     change = dict(zip(find_aid(analysis).lever_arm, lever_arm_m.tolist(), strict=False))
     imu_arm_m = np.subtract(imu_position_m[:2], lever_arm[:2]).round(2) + 0.0
-    imu_change = dict(zip(IMU_POSITION_PARAMETERS, imu_arm_m.tolist(), strict=False))
+    imu_position_change = dict(zip(IMU_POSITION_PARAMETERS, imu_arm_m.tolist(), strict=False))
     rotation_deg = (
         lever_arm.rotation_deg
         + find_convention_faults(convention, analysis.flight, source.frame).rotation_deg
@@ -173,14 +175,14 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     # The new lever arm of the sensor hardly reduces EKF2's error against ground truth: test another
     # position of the IMU
     if effect_sentence is None:
-        effect_sentence = _describe_replayed_effect(analysis, imu_change, rotation_deg)
-        sensor_text, action = "IMU", f"Set {format_changes(imu_change)}."
+        effect_sentence = _describe_replayed_effect(analysis, imu_position_change, rotation_deg)
+        sensor_text, action = "IMU", f"Set {format_changes(imu_position_change)}."
         error_text = "EKF2's position error"
         forward_m, right_m = 0.0 - forward_m, 0.0 - right_m
     elif any(imu_position_m) and not has_truth:
         action += (
             " If the sensor position parameters are right, the IMU position is wrong: set "
-            f"{format_changes(imu_change)} instead."
+            f"{format_changes(imu_position_change)} instead."
         )
     if effect_sentence is None:
         return
@@ -240,7 +242,7 @@ def _describe_replayed_effect(
             for name in Columns.POSITION[:2]
         ]
         rmses_m.append(float(np.sqrt(np.mean(np.square(np.hypot(*axis_errors_m))))))
-    if rmses_m[1] > MAX_LEVER_ARM_RMSE_RATIO * rmses_m[0]:
+    if rmses_m[1] > MAX_RMSE_RATIO_WITH_TO_WITHOUT_LEVER_ARM * rmses_m[0]:
         return None
     rmse_text = " m → ".join(map(format_metres, rmses_m))
     return f"Replay of EKF2 with this lever arm: horizontal position RMSE {rmse_text} m. "
@@ -250,7 +252,7 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     """Detect two senders whose positions alternate."""
     samples = analysis.source_samples[Columns.POSITION].dropna(axis=1, how="all").dropna()
     window_count, rate_hz = (len(samples) - 2) // WINDOW_SAMPLES, analysis.source.compute_rate_hz()
-    if window_count < MIN_WINDOWS_FOR_TWO_SENDERS:
+    if window_count < MIN_SAMPLE_WINDOWS_TO_DETECT_TWO_SENDERS:
         return
     time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
     weight = ((time_s[1:-1] - time_s[:-2]) / (time_s[2:] - time_s[:-2]))[:, None]
@@ -262,14 +264,14 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     medians_m = np.median(windows_m, axis=1)
     largest_median_m = medians_m[np.argmax(np.linalg.norm(medians_m, axis=1))]
     medians_m[medians_m @ largest_median_m < 0.0] *= -1.0
-    deviation_m = np.median(medians_m, axis=0)
-    scatter_m = 1.4826 * np.median(np.abs(medians_m - deviation_m), axis=0).max()
-    distance_m = float(np.linalg.norm(deviation_m))
+    difference_between_senders_m = np.median(medians_m, axis=0)
+    scatter_m = 1.4826 * np.median(np.abs(medians_m - difference_between_senders_m), axis=0).max()
+    distance_m = float(np.linalg.norm(difference_between_senders_m))
     if distance_m < max(MIN_SENDER_DISTANCE_M, MIN_SENDER_DISTANCE_SIGMAS * scatter_m):
         return
     distance_texts = ", ".join(
         f"{abs(part):.2f} m {name.partition('_')[0]}"
-        for part, name in zip(deviation_m, samples.columns, strict=True)
+        for part, name in zip(difference_between_senders_m, samples.columns, strict=True)
     )
     yield make_error(
         "source_two_senders",
@@ -298,7 +300,8 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
         positions = samples[::interval]
         time_s = positions.index.to_numpy() - delay_s
         is_moving = (
-            np.linalg.norm(ekf2_position_spline(time_s, 1), axis=1) > MIN_SPEED_FOR_COPY_TEST_M_S
+            np.linalg.norm(ekf2_position_spline(time_s, 1), axis=1)
+            > MIN_SPEED_TO_DETECT_COPIED_ESTIMATE_M_S
         )
         is_inside = (time_s > state.index[0]) & (time_s < state.index[-1]) & is_moving
         if np.count_nonzero(is_inside) < WINDOW_SAMPLES:
@@ -307,9 +310,9 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
         return float(np.median(distance_m[is_inside]))
 
     # Some of the positions are sufficient to find the delay
-    interval = max(1, len(samples) // COPY_DELAY_POSITIONS)
+    interval = max(1, len(samples) // POSITION_COUNT_TO_FIND_DELAY_OF_COPY)
     delay_s = min(
-        TESTED_COPY_DELAYS_S.tolist(),
+        TESTED_DELAYS_OF_COPIED_ESTIMATE_S.tolist(),
         key=lambda delay_s: compute_median_distance_m(delay_s, interval),
     )
     distance_m = compute_median_distance_m(delay_s)

@@ -50,7 +50,7 @@ class SourceOrigin(Record):
     # EKF2's aiding source for these positions; None if EKF2 never fuses them
     aid: Aid | None
     # True if px4fuse may select the source by default
-    is_auto_candidate: bool = True
+    is_selectable_by_default: bool = True
 
     @property
     def may_drift(self) -> bool:
@@ -93,7 +93,7 @@ MOTION_CAPTURE_ORIGIN = SourceOrigin("mocap", "as received", None)
 ALIGNED_BY_EKF2_ORIGIN = SourceOrigin("uwb", "aligned by EKF2", EV_POS)
 KEPT_BY_EKF2_ORIGIN = SourceOrigin("uwb", "kept by EKF2", EV_POS)
 REBUILT_FROM_INNOVATIONS_ORIGIN = SourceOrigin("uwb", "rebuilt from innovations", EV_POS)
-GNSS_ORIGIN = SourceOrigin("gnss", "as received", GNSS_POS, is_auto_candidate=False)
+GNSS_ORIGIN = SourceOrigin("gnss", "as received", GNSS_POS, is_selectable_by_default=False)
 # All origins of positions, in order of preference
 SOURCE_ORIGINS = (
     POSITION_FILE_ORIGIN,
@@ -292,7 +292,7 @@ MIN_REGULAR_INTERVAL_FRACTION = 0.8
 METHODS_WITHOUT_MEASUREMENT_TIMES = ("arrival time", "receive time", "message order")
 HEIGHT_ONLY_REASON = "x and y are NaN in all messages, so the source measures only the height"
 # Ratio of the median absolute second difference to the σ of white noise
-SECOND_DIFFERENCE_PER_SIGMA = 6.0**0.5 / 1.4826
+MEDIAN_ABS_SECOND_DIFFERENCE_PER_SIGMA = 6.0**0.5 / 1.4826
 # Minimum number of positions to estimate their noise
 MIN_NOISE_SAMPLES = 10
 # Minimum noise (1 σ, m) of UWB positions
@@ -417,7 +417,7 @@ class PositionTrack:
     # Reset counter, quality and delay until arrival in PX4, if logged
     status: pd.DataFrame = field(default_factory=pd.DataFrame)
     # Quantisation step of the horizontal position; 0 if not quantised
-    rounding_step_m: float = 0.0
+    quantisation_step_m: float = 0.0
 
     __repr__ = one_line_repr
 
@@ -469,7 +469,9 @@ def estimate_white_noise_m(position_m: Array) -> float:
     The estimate uses second differences, which are zero at constant velocity.
     """
     second_difference_m = np.abs(np.diff(position_m, 2, axis=0))
-    return float(np.median(second_difference_m, axis=0).max()) / SECOND_DIFFERENCE_PER_SIGMA
+    return (
+        float(np.median(second_difference_m, axis=0).max()) / MEDIAN_ABS_SECOND_DIFFERENCE_PER_SIGMA
+    )
 
 
 def infer_position_kind(samples: pd.DataFrame) -> PositionKind:
@@ -536,9 +538,9 @@ class FusionRecord:
     # All EKF2 parameters at the start of the log, in PX4 units
     parameters: Mapping[str, float]
     # EKF2's state and variances at the fusion horizon
-    delayed: pd.DataFrame
+    delayed_state: pd.DataFrame
     # True if EKF2 stores biases as increments per prediction (up to PX4 v1.14)
-    stores_bias_increments: bool
+    has_delta_angle_biases: bool
     # Other aiding sources that EKF2 fuses as horizontal position or velocity
     other_horizontal_aids: tuple[str, ...]
     # Delay (s) from measurement to publication of each external vision sample
@@ -561,7 +563,7 @@ class FusionRecord:
 
     def stores_latitude(self) -> bool:
         """Return True if EKF2 stores the position as latitude and longitude (since v1.16)."""
-        return not np.isfinite(self.delayed["north_m"]).any()
+        return not np.isfinite(self.delayed_state["north_m"]).any()
 
     def was_flag_set(self, flag: str, times_s: Array) -> BoolArray:
         """Return True for each time at which the status flag of EKF2 was set."""

@@ -150,7 +150,7 @@ class Inventory:
 
 def list_log_contents(flight: Flight) -> Inventory:
     """List the data in a log, the possible analyses and the logging advice."""
-    comparison, reason, position_remedy = None, "", ""
+    comparison, reason, missing_position_remedy = None, "", ""
     try:
         comparison = prepare_comparison_inputs(
             flight, ComparisonRequest(log=flight.log.name), keep_positions_as_sent=True
@@ -158,9 +158,9 @@ def list_log_contents(flight: Flight) -> Inventory:
         reason = comparison.source_reason
     except Px4FuseError as error:
         reason = replace_argument_names(error.reason).removeprefix(f"{flight.log.name}: ")
-        position_remedy = replace_argument_names(error.remedy)
+        missing_position_remedy = replace_argument_names(error.remedy)
         if not isinstance(error, MissingDataError):
-            position_remedy = (
+            missing_position_remedy = (
                 "Set SDLOG_MODE to 0 (logging from arming) to record the whole flight."
             )
     if comparison is not None:
@@ -174,7 +174,7 @@ def list_log_contents(flight: Flight) -> Inventory:
         source_reason=reason,
         segment=None if comparison is None else comparison.segment,
         abilities=tuple(_list_analyses(flight, comparison, reason)),
-        advice=_collect_logging_advice(flight, comparison, position_remedy),
+        advice=_collect_logging_advice(flight, comparison, missing_position_remedy),
         notes=(
             *log.damage,
             *["the log ends in flight and does not contain the landing"] * is_landing_missing,
@@ -345,16 +345,18 @@ def _list_ekf2_and_truth_analyses(
 
 
 def _collect_logging_advice(
-    flight: Flight, comparison: PreparedComparison | None, position_remedy: str
+    flight: Flight, comparison: PreparedComparison | None, missing_position_remedy: str
 ) -> tuple[LoggingAdvice, ...]:
     """Collect logging advice for the next flight.
 
-    ``position_remedy`` is the advice for a log without positions.
+    ``missing_position_remedy`` is the advice for a log without positions.
     """
     if flight.log.is_assessed:
         return (LoggingAdvice("None", (DIAGNOSIS_WITHHELD.reason,)),)
-    findings = [*recording.detect_lost_data(flight), *recording.detect_decreasing_clocks(flight)]
-    actions_and_purposes = [(position_remedy, "position")] if position_remedy else []
+    findings = [*recording.detect_lost_data(flight), *recording.detect_backward_clock_jumps(flight)]
+    actions_and_purposes = (
+        [(missing_position_remedy, "position")] if missing_position_remedy else []
+    )
     if comparison is not None:
         findings += [
             *recording.detect_source_not_logged(comparison),

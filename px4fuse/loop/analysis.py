@@ -125,7 +125,7 @@ def analyse(
         closure_percent = 100.0 * closure_error_m / float(distance_m[-1])
         closure_error_axes_m = split_by_axis(path.frame, error_m)
     heading_error_deg = _compute_heading_error(true_end, odometry_heading_change_deg)
-    paths_corrected_by_distance = distribute_closure_error_by_distance(
+    paths_with_distributed_closure_error = distribute_closure_error_by_distance(
         path, distance_m, closure_error_vector_m, heading_error_deg, tested_closures
     )
     references = tuple(track for track in (truth, reference) if track is not None)
@@ -151,7 +151,7 @@ def analyse(
         odometry_noise=noise,
         closures=tested_closures,
         corrections=score_paths(
-            path, paths_corrected_by_distance | pose_graph_corrections, references
+            path, paths_with_distributed_closure_error | pose_graph_corrections, references
         ),
         notes=tuple(note for note in notes if note),
         distance_m=distance_m,

@@ -8,10 +8,10 @@ import numpy as np
 
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import (
-    NOT_WRITTEN,
+    NOT_IN_JSON,
     Count,
+    NotInJson,
     NotNegative,
-    NotWritten,
     OrUnavailable,
     Record,
     Share,
@@ -123,9 +123,9 @@ class PathResult(Record, kw_only=True):
     iterations: Count | None = None
     converged: bool | None = None
     scores: Mapping[str, OrUnavailable[Evaluation]]
-    name: NotWritten[str] = NOT_WRITTEN
-    trajectory: NotWritten[Trajectory] = NOT_WRITTEN
-    solution: NotWritten[Solution | None] = None
+    name: NotInJson[str] = NOT_IN_JSON
+    trajectory: NotInJson[Trajectory] = NOT_IN_JSON
+    solution: NotInJson[Solution | None] = None
 
 
 class Loop(Record, kw_only=True):
@@ -169,12 +169,12 @@ class Loop(Record, kw_only=True):
     closures: tuple[Closure, ...]
     corrections: Mapping[CorrectionName, OrUnavailable[PathResult]]
     notes: tuple[str, ...]
-    distance_m: NotWritten[Array] = NOT_WRITTEN
-    graph: NotWritten[PoseGraph | Unavailable] = NOT_WRITTEN
-    references: NotWritten[tuple[Trajectory, ...]] = NOT_WRITTEN
-    original_frame: NotWritten[Frame] = NOT_WRITTEN
-    is_assessed: NotWritten[bool] = False
-    orientation_findings: NotWritten[tuple[Finding, ...]] = ()
+    distance_m: NotInJson[Array] = NOT_IN_JSON
+    graph: NotInJson[PoseGraph | Unavailable] = NOT_IN_JSON
+    references: NotInJson[tuple[Trajectory, ...]] = NOT_IN_JSON
+    original_frame: NotInJson[Frame] = NOT_IN_JSON
+    is_assessed: NotInJson[bool] = False
+    orientation_findings: NotInJson[tuple[Finding, ...]] = ()
 
     @property
     def odometry(self) -> PathResult:

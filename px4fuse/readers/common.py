@@ -23,7 +23,7 @@ MAX_VALID_SI_VALUE = 1e9
 MAX_IMU_READING = 1e4
 # A position 0, 0, 0 is invalid if its distance (m) from the previous and the next position exceeds
 # this limit (3 σ of UWB)
-MIN_INVALID_ZERO_DISTANCE_M = 0.3
+MIN_DISTANCE_OF_INVALID_ZERO_POSITION_M = 0.3
 # A position is damaged if its distance (m) from the median position exceeds this limit and the
 # following multiple of the median distance
 MIN_DAMAGED_DISTANCE_M = 1e4
@@ -36,7 +36,7 @@ MIN_FROZEN_POSITION_COUNT = 5
 # Maximum fraction of frozen positions; with more, the vehicle may be at rest
 MAX_FROZEN_FRACTION = 0.5
 # Maximum probability that randomly repeated positions are rejected as frozen
-MAX_FALSE_FROZEN_PROBABILITY = 0.01
+MAX_FALSE_ALARM_PROBABILITY_OF_FROZEN_RUN = 0.01
 # Tolerance (fraction of the quantisation step) for the detection of rounded values
 MAX_DIFFERENCE_FROM_INTEGER = 0.01
 # Minimum norm of a valid quaternion; senders without attitude send zeros
@@ -168,7 +168,7 @@ def classify_invalid_positions(samples: pd.DataFrame, columns: list[str]) -> "pd
             np.clip([next_index - 1, next_index], 0, len(nonzero_rows) - 1)
         ]
         distance_m = np.linalg.norm(values[neighbour_rows], axis=2).min(axis=0)
-        reason_by_row.iloc[zero_rows[distance_m > MIN_INVALID_ZERO_DISTANCE_M]] = "zero"
+        reason_by_row.iloc[zero_rows[distance_m > MIN_DISTANCE_OF_INVALID_ZERO_POSITION_M]] = "zero"
     valid_rows = np.flatnonzero(reason_by_row == "")
     if len(valid_rows):
         offset_from_median_m = values[valid_rows] - np.median(values[valid_rows], axis=0)
@@ -187,9 +187,9 @@ def classify_invalid_positions(samples: pd.DataFrame, columns: list[str]) -> "pd
     run_ends = np.append(run_starts[1:], len(valid_rows))
     # Longest run of equal positions that is likely if the source repeats single positions at random
     repeated_fraction = np.clip(np.mean(is_repeated), 1e-6, 1.0 - 1e-6)
-    max_random_run_length = np.log(len(valid_rows) / MAX_FALSE_FROZEN_PROBABILITY) / -np.log(
-        repeated_fraction
-    )
+    max_random_run_length = np.log(
+        len(valid_rows) / MAX_FALSE_ALARM_PROBABILITY_OF_FROZEN_RUN
+    ) / -np.log(repeated_fraction)
     run_lengths = run_ends - run_starts
     is_frozen_run = (run_lengths >= max(MIN_FROZEN_POSITION_COUNT, max_random_run_length)) & (
         valid_times_s[run_ends - 1] - valid_times_s[run_starts] >= MIN_FROZEN_S
@@ -200,7 +200,7 @@ def classify_invalid_positions(samples: pd.DataFrame, columns: list[str]) -> "pd
     return reason_by_row
 
 
-def estimate_rounding_step(values: Array) -> float:
+def estimate_quantisation_step(values: Array) -> float:
     """Return the quantisation step of rounded values; 0 if the values are not rounded."""
     differences = np.diff(np.unique(values[np.isfinite(values)]))
     if not len(differences):
@@ -214,7 +214,7 @@ def estimate_rounding_step(values: Array) -> float:
     )
 
 
-def interpolate_inside(time_s: pd.Index | Array, values: "pd.Series[float]") -> Array:
+def interpolate_inside_time_span(time_s: pd.Index | Array, values: "pd.Series[float]") -> Array:
     """Interpolate a time series at the given times; NaN outside its time span."""
     return np.asarray(np.interp(time_s, values.index, values, left=np.nan, right=np.nan))
 

@@ -187,14 +187,14 @@ def _read_ekf2(recording: Recording, parameters: Mapping[str, float]) -> Ekf2 | 
             )
     if len(variance):
         recording.record_stream("ekf2_variance", message_name)
-    unavailable_variance = Unavailable(
+    reason_for_missing_variance = Unavailable(
         "EKF2 variances",
         "the recording has no ODOMETRY with covariance and no ESTIMATOR_STATUS",
         remedies.get("variance", remedies["state"]),
     )
     return Ekf2(
         state=state,
-        variance=variance if len(variance) else unavailable_variance,
+        variance=variance if len(variance) else reason_for_missing_variance,
         innovations={
             axis: Unavailable(
                 f"EKF2 innovations, {axis}",
@@ -336,7 +336,7 @@ def _estimate_start_unix_s(recording: Recording) -> float | None:
     receive_times_us = recording.frames.receive_times_us
     if boot_to_unix_fit := map_boot_to_unix(recording):
         return float(boot_to_unix_fit.at(recording.time_origin_s))
-    if receive_times_us is None or not recording.receipt_to_boot_fit.reading_pair_count:
+    if receive_times_us is None or not recording.receive_to_boot_time_fit.reading_pair_count:
         return None
-    receipt_s = recording.receipt_to_boot_fit.inverse().at(recording.time_origin_s)
+    receipt_s = recording.receive_to_boot_time_fit.inverse().at(recording.time_origin_s)
     return float(receive_times_us[0] * 1e-6 + receipt_s)

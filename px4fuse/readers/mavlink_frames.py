@@ -161,14 +161,16 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
             f"{len(start_offsets)} frames with a valid checksum in {len(content)} bytes.",
             "Give a .ulg, a .tlog or a raw MAVLink stream.",
         )
-    receive_time_bytes = RECEIVE_TIME_BYTES if _has_receive_times(start_offsets, end_offsets) else 0
+    receive_time_size_bytes = (
+        RECEIVE_TIME_BYTES if _has_receive_times(start_offsets, end_offsets) else 0
+    )
     content_bytes = np.frombuffer(content, dtype=np.uint8)
     is_version_2 = content_bytes[start_offsets] == MAGIC_BYTE_V2
     # Sequence number, system id and component id are consecutive bytes
     sequence_offsets = start_offsets + np.where(is_version_2, 4, 2)
     unknown_frame_count, byte_count_outside_frames, is_last_frame_incomplete = (
         _count_bytes_outside_frames(
-            content, start_offsets - receive_time_bytes, end_offsets, receive_time_bytes
+            content, start_offsets - receive_time_size_bytes, end_offsets, receive_time_size_bytes
         )
     )
     return MavlinkFrames(
@@ -183,7 +185,7 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
         payload_offsets=start_offsets + np.where(is_version_2, HEADER_BYTES_V2, HEADER_BYTES_V1),
         payload_lengths=content_bytes[start_offsets + 1],
         receive_times_us=_read_receive_times(content_bytes, start_offsets, end_offsets)
-        if receive_time_bytes
+        if receive_time_size_bytes
         else None,
         unknown_frame_count=unknown_frame_count,
         byte_count_outside_frames=byte_count_outside_frames,
@@ -242,13 +244,13 @@ def _find_possible_frames(
     start_offsets = block_start + np.flatnonzero(
         (block == MAGIC_BYTE_V1) | (block == MAGIC_BYTE_V2)
     )
-    header_bytes = np.where(
+    header_sizes_bytes = np.where(
         content_bytes[start_offsets] == MAGIC_BYTE_V2, HEADER_BYTES_V2, HEADER_BYTES_V1
     )
-    has_whole_header = start_offsets + header_bytes + CHECKSUM_BYTES <= len(content_bytes)
+    has_whole_header = start_offsets + header_sizes_bytes + CHECKSUM_BYTES <= len(content_bytes)
     start_offsets = start_offsets[has_whole_header]
-    header_bytes = header_bytes[has_whole_header]
-    is_version_2 = header_bytes == HEADER_BYTES_V2
+    header_sizes_bytes = header_sizes_bytes[has_whole_header]
+    is_version_2 = header_sizes_bytes == HEADER_BYTES_V2
     start_offsets_v2 = start_offsets[is_version_2]
     message_ids = content_bytes[start_offsets + 5].astype(np.int64)
     message_ids[is_version_2] = (
@@ -259,7 +261,7 @@ def _find_possible_frames(
     is_candidate[is_version_2] &= (content_bytes[start_offsets_v2 + 9] == 0) & (
         content_bytes[start_offsets_v2 + 2] <= SIGNED_FLAG
     )
-    crc_end = start_offsets + content_bytes[start_offsets + 1] + header_bytes
+    crc_end = start_offsets + content_bytes[start_offsets + 1] + header_sizes_bytes
     end_offsets = crc_end + CHECKSUM_BYTES
     end_offsets[is_version_2] += SIGNATURE_BYTES * (
         content_bytes[start_offsets_v2 + 2] & SIGNED_FLAG
@@ -280,7 +282,7 @@ def _has_receive_times(start_offsets: Int64Array, end_offsets: Int64Array) -> bo
 
 
 def _count_bytes_outside_frames(
-    content: bytes, start_offsets: Int64Array, end_offsets: Int64Array, receive_time_bytes: int
+    content: bytes, start_offsets: Int64Array, end_offsets: Int64Array, receive_time_size_bytes: int
 ) -> tuple[int, int, bool]:
     """Count the frames with unknown messages, and the bytes outside of all frames.
 
@@ -296,32 +298,36 @@ def _count_bytes_outside_frames(
         gap_start_offsets < gap_end_offsets
     ].tolist():
         offset = gap_start
-        for frame_bytes in _measure_unknown_frames(content, gap_start, gap_end, receive_time_bytes):
+        for frame_bytes in _measure_unknown_frames(
+            content, gap_start, gap_end, receive_time_size_bytes
+        ):
             unknown_frame_count += 1
             offset += frame_bytes
         byte_count_outside_frames += gap_end - offset
         bytes_after_last_frame = content[offset:gap_end] if gap_end == len(content) else b""
     # Also True if the file ends before the first byte of the frame
-    begins_frame = {*bytes_after_last_frame[receive_time_bytes : receive_time_bytes + 1]} <= {
+    begins_frame = {
+        *bytes_after_last_frame[receive_time_size_bytes : receive_time_size_bytes + 1]
+    } <= {
         MAGIC_BYTE_V1,
         MAGIC_BYTE_V2,
     }
     is_last_frame_incomplete = (
-        0 < len(bytes_after_last_frame) < receive_time_bytes + MAX_FRAME_BYTES and begins_frame
+        0 < len(bytes_after_last_frame) < receive_time_size_bytes + MAX_FRAME_BYTES and begins_frame
     )
     return unknown_frame_count, byte_count_outside_frames, is_last_frame_incomplete
 
 
 def _measure_unknown_frames(
-    content: bytes, offset: int, gap_end: int, receive_time_bytes: int
+    content: bytes, offset: int, gap_end: int, receive_time_size_bytes: int
 ) -> Iterator[int]:
     """Yield the size (bytes) of each frame with an unknown message between valid frames."""
-    while offset + receive_time_bytes + HEADER_BYTES_V1 + CHECKSUM_BYTES <= gap_end:
+    while offset + receive_time_size_bytes + HEADER_BYTES_V1 + CHECKSUM_BYTES <= gap_end:
         header = content[
-            offset + receive_time_bytes : offset + receive_time_bytes + HEADER_BYTES_V2
+            offset + receive_time_size_bytes : offset + receive_time_size_bytes + HEADER_BYTES_V2
         ]
         message_id = header[5]
-        frame_bytes = receive_time_bytes + header[1] + HEADER_BYTES_V1 + CHECKSUM_BYTES
+        frame_bytes = receive_time_size_bytes + header[1] + HEADER_BYTES_V1 + CHECKSUM_BYTES
         if header[0] == MAGIC_BYTE_V2:
             message_id = int.from_bytes(header[7:10], "little")
             frame_bytes += (

@@ -94,9 +94,9 @@ def _read_track(
     rows = recording.rows(source.message, sender)
     table = recording.frames.table(source.message, rows)
     if source.estimator_type is not None:
-        is_of_estimator = table["estimator_type"] == source.estimator_type
-        rows = rows[is_of_estimator]
-        table = table[is_of_estimator]
+        has_estimator_type_of_source = table["estimator_type"] == source.estimator_type
+        rows = rows[has_estimator_type_of_source]
+        table = table[has_estimator_type_of_source]
     if not len(rows):
         return None
     track_name = source.track_name + (f"_{sender[0]}_{sender[1]}" if len(senders) > 1 else "")
@@ -163,13 +163,13 @@ def _read_gnss(
             f"the recording has {message_count} {layout.topic}, {len(fixes)} with a 3D fix",
             NO_FIX_ACTION,
         )
-    is_auto_candidate = bool(
+    is_selectable_by_default = bool(
         recording.read(MESSAGE_LAYOUTS["GLOBAL_POSITION_INT"])["latitude_deg"].any()
     )
     return make_track(
         layout.topic,
         convert_gnss_fixes(fixes, find_local_origin(recording)),
-        structs.replace(GNSS_ORIGIN, is_auto_candidate=is_auto_candidate),
+        structs.replace(GNSS_ORIGIN, is_selectable_by_default=is_selectable_by_default),
         description="GNSS position",
         frame="NED",
         clock=f"{BOOT_CLOCK_TEXT}: timestamp minus {1e3 * delay_s:g} ms",

@@ -30,7 +30,7 @@ from px4fuse.readers.mavlink_messages import (
     CONVERSION_BY_MAV_FRAME,
     REMEDIES,
 )
-from px4fuse.readers.ulog_topics import longest_increasing_run
+from px4fuse.readers.ulog_topics import find_longest_increasing_subsequence
 from px4fuse.trajectory.rotation import rotate
 
 BOOT_CLOCK_TEXT = "autopilot boot clock"
@@ -151,7 +151,7 @@ class Recording:
     # Receive time (s) of each frame. Without receive times: last boot time in the stream before it
     receive_times_s: Array
     # Conversion of receive times to the boot clock
-    receipt_to_boot_fit: ClockLine
+    receive_to_boot_time_fit: ClockLine
     # Time since boot of the autopilot (s) at time zero of the flight
     time_origin_s: float
     duration_s: float
@@ -245,7 +245,7 @@ class Recording:
         time_us = np.rint(boot_times_s[rows] * 1e6).astype(np.int64)
         # A message that is received twice, over two links, does not count as dropped
         first_row_of_each_time = np.sort(np.unique(time_us, return_index=True)[1])
-        increasing_time_rows = longest_increasing_run(time_us[first_row_of_each_time])
+        increasing_time_rows = find_longest_increasing_subsequence(time_us[first_row_of_each_time])
         dropped_count = np.count_nonzero(~is_valid) + (
             len(first_row_of_each_time) - len(increasing_time_rows)
         )
@@ -258,11 +258,12 @@ class Recording:
 
         The conversion removes the minimum delay of the link.
         """
-        return self.receipt_to_boot_fit.at(self.receive_times_s[rows])
+        return self.receive_to_boot_time_fit.at(self.receive_times_s[rows])
 
     def compute_boot_times_s(self, table: NDArray[Any], rows: IntArray) -> Array:
         """Return the time since boot (s) of each message; without timestamp, its receive time."""
-        if not self.receipt_to_boot_fit.reading_pair_count:  # no message contains the boot clock
+        # No message contains the boot clock
+        if not self.receive_to_boot_time_fit.reading_pair_count:
             return self.compute_receipt_boot_times_s(rows)
         if "time_boot_ms" in (table.dtype.names or ()):
             return np.asarray(table["time_boot_ms"] * 1e-3)
@@ -358,15 +359,16 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
             f"s after boot ({longest_part_fraction:.0%} of the data)"
         )
     increasing_time_rows = _remove_stray_timestamps(
-        boot_times_s, longest_increasing_run(np.rint(boot_times_s * 1e6).astype(np.int64))
+        boot_times_s,
+        find_longest_increasing_subsequence(np.rint(boot_times_s * 1e6).astype(np.int64)),
     )
     rows, boot_times_s = rows[increasing_time_rows], boot_times_s[increasing_time_rows]
-    receipt_to_boot_fit = ClockLine(0.0, 0.0, 1.0, 0.0, len(rows))
+    receive_to_boot_time_fit = ClockLine(0.0, 0.0, 1.0, 0.0, len(rows))
     receive_times_s = np.zeros(len(frames))
     if frames.receive_times_us is not None:
         receive_times_s = (frames.receive_times_us - frames.receive_times_us[0]) * 1e-6
         if len(rows):
-            receipt_to_boot_fit = fit_clock_line(boot_times_s, receive_times_s[rows]).inverse()
+            receive_to_boot_time_fit = fit_clock_line(boot_times_s, receive_times_s[rows]).inverse()
     elif len(rows):
         # A raw stream has no receive times. Use the last boot time before each frame
         message_count = np.searchsorted(rows, np.arange(len(frames)), side="right")
@@ -382,7 +384,7 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
         autopilot,
         analysed_frame_slice,
         receive_times_s,
-        receipt_to_boot_fit,
+        receive_to_boot_time_fit,
         time_origin_s,
         end_s - time_origin_s,
         notes,

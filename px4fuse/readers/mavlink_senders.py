@@ -45,7 +45,7 @@ MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S = 1e5
 MAX_BOOT_TIME_DIFFERENCE_S = 10.0
 # Timestamps are not boot times if a conversion by TIMESYNC reduces their median difference (s) from
 # the receive times by at least this value
-MIN_REDUCTION_BY_TIMESYNC_S = 0.1
+MIN_CLOCK_DIFFERENCE_REDUCTION_BY_TIMESYNC_S = 0.1
 MIN_TIMESYNC_REPLIES = 3
 # Maximum interval (s) between positions; a longer interval is a gap
 MAX_REGULAR_SAMPLE_INTERVAL_S = 1.0
@@ -203,7 +203,7 @@ def _map_sender_clock(
         f"system {sender[0]}, component {sender[1]}",
         np.concatenate(timestamps_s),
         np.concatenate(receive_times_s),
-        recording.receipt_to_boot_fit,
+        recording.receive_to_boot_time_fit,
         (timesync_request_times_s[is_sender_reply], sender_reply_times_s[is_sender_reply]),
         (sender_request_times_s[is_autopilot_reply], autopilot_reply_times_s[is_autopilot_reply]),
         boot_to_unix_fit,
@@ -215,9 +215,9 @@ def map_clock_to_boot(
     name: str,
     timestamps_s: Array,
     receive_times_s: Array,
-    receipt_to_boot_fit: ClockLine,
-    sender_replies: ArrayPair,
-    autopilot_replies: ArrayPair,
+    receive_to_boot_time_fit: ClockLine,
+    sender_timesync_replies: ArrayPair,
+    autopilot_timesync_replies: ArrayPair,
     boot_to_unix_fit: ClockLine | None,
     *,
     has_receive_times: bool,
@@ -238,11 +238,11 @@ def map_clock_to_boot(
         Name of the sender.
     timestamps_s, receive_times_s : ndarray, shape (n,)
         Timestamp (sender's clock) and receive time of each message.
-    receipt_to_boot_fit : ClockLine
+    receive_to_boot_time_fit : ClockLine
         Conversion of receive times to the boot clock.
-    sender_replies : tuple of ndarray
+    sender_timesync_replies : tuple of ndarray
         TIMESYNC request times (s, boot clock) and reply times (s, sender's clock).
-    autopilot_replies : tuple of ndarray
+    autopilot_timesync_replies : tuple of ndarray
         TIMESYNC request times (s, sender's clock) and reply times (s, boot clock).
     boot_to_unix_fit : ClockLine or None
         Conversion of the boot clock to UNIX time.
@@ -250,7 +250,7 @@ def map_clock_to_boot(
         True if the recording contains receive times.
     """
     time_source = "receive time" if has_receive_times else "message order"
-    boot_time_at_receipt_s = receipt_to_boot_fit.at(receive_times_s)
+    boot_time_at_receipt_s = receive_to_boot_time_fit.at(receive_times_s)
     if not is_running_clock(timestamps_s):
         distinct_count = len(np.unique(timestamps_s))
         note = (
@@ -271,11 +271,11 @@ def map_clock_to_boot(
     def compute_difference_from_receipt_s(boot_time_s: Array) -> float:
         return abs(float(np.median(boot_time_at_receipt_s - boot_time_s)))
 
-    timesync_fit = _fit_timesync(sender_replies, autopilot_replies)
+    timesync_fit = _fit_timesync(sender_timesync_replies, autopilot_timesync_replies)
     difference_from_receipt_s = compute_difference_from_receipt_s(timestamps_s)
     # A sender clock that started only seconds after the autopilot resembles the boot clock. If
     # TIMESYNC is available, it shows the difference
-    reduction_by_timesync_s = (
+    clock_difference_reduction_by_timesync_s = (
         0.0
         if timesync_fit is None
         else difference_from_receipt_s
@@ -283,11 +283,11 @@ def map_clock_to_boot(
     )
     if (
         difference_from_receipt_s <= MAX_BOOT_TIME_DIFFERENCE_S
-        and reduction_by_timesync_s < MIN_REDUCTION_BY_TIMESYNC_S
+        and clock_difference_reduction_by_timesync_s < MIN_CLOCK_DIFFERENCE_REDUCTION_BY_TIMESYNC_S
     ):
-        same_clock = ClockLine(0.0, 0.0, 1.0, 0.0, len(timestamps_s))
+        identity_clock_line = ClockLine(0.0, 0.0, 1.0, 0.0, len(timestamps_s))
         note = "the timestamps of the sender are boot times of the autopilot"
-        return _make_clock_mapping(name, "boot clock", same_clock, timestamps_s, note)
+        return _make_clock_mapping(name, "boot clock", identity_clock_line, timestamps_s, note)
     clock_kind = "UNIX time" if np.median(timestamps_s) > MIN_UNIX_TIME_S else "clock"
     clock_name = f"{clock_kind} of {name}"
     candidate_fits = [] if timesync_fit is None else [("TIMESYNC", timesync_fit, "")]
@@ -304,8 +304,8 @@ def map_clock_to_boot(
     sender_to_boot_fit = fit_clock_line(timestamps_s, receive_times_s)
     sender_to_boot_fit = replace(
         sender_to_boot_fit,
-        y0=float(receipt_to_boot_fit.at(sender_to_boot_fit.y0)),
-        slope=sender_to_boot_fit.slope * receipt_to_boot_fit.slope,
+        y0=float(receive_to_boot_time_fit.at(sender_to_boot_fit.y0)),
+        slope=sender_to_boot_fit.slope * receive_to_boot_time_fit.slope,
     )
     note = (
         "the recording has no usable TIMESYNC or SYSTEM_TIME. All sample times are late by the "
@@ -314,15 +314,17 @@ def map_clock_to_boot(
     return _make_clock_mapping(clock_name, time_source, sender_to_boot_fit, timestamps_s, note)
 
 
-def _fit_timesync(sender_replies: ArrayPair, autopilot_replies: ArrayPair) -> ClockLine | None:
+def _fit_timesync(
+    sender_timesync_replies: ArrayPair, autopilot_timesync_replies: ArrayPair
+) -> ClockLine | None:
     """Fit the conversion of sender clock to boot clock by TIMESYNC, as mean of both directions."""
     clock_fits = []
-    if len(sender_replies[0]) >= MIN_TIMESYNC_REPLIES:
+    if len(sender_timesync_replies[0]) >= MIN_TIMESYNC_REPLIES:
         # fit_clock_line needs the earlier reading first: the request (boot time). The inverse of
         # its result converts sender time to boot time
-        clock_fits.append(fit_clock_line(*sender_replies).inverse())
-    if len(autopilot_replies[0]) >= MIN_TIMESYNC_REPLIES:
-        clock_fits.append(fit_clock_line(*autopilot_replies))
+        clock_fits.append(fit_clock_line(*sender_timesync_replies).inverse())
+    if len(autopilot_timesync_replies[0]) >= MIN_TIMESYNC_REPLIES:
+        clock_fits.append(fit_clock_line(*autopilot_timesync_replies))
     if not clock_fits:
         return None
     x0 = clock_fits[0].x0
@@ -349,10 +351,10 @@ def describe_clock_conversions(
     """Describe the conversions of sender clocks and receive times to the boot clock."""
     clock_descriptions = [mapping.description for mapping in clock_mappings.values()]
     receive_times_us = recording.frames.receive_times_us
-    receipt_to_boot_fit = recording.receipt_to_boot_fit
-    if receive_times_us is not None and receipt_to_boot_fit.reading_pair_count:
+    receive_to_boot_time_fit = recording.receive_to_boot_time_fit
+    if receive_times_us is not None and receive_to_boot_time_fit.reading_pair_count:
         note = "the messages were recorded during a replay that was faster or slower than real time"
-        if abs(receipt_to_boot_fit.slope - 1.0) < MAX_RELATIVE_CLOCK_RATE_DIFFERENCE:
+        if abs(receive_to_boot_time_fit.slope - 1.0) < MAX_RELATIVE_CLOCK_RATE_DIFFERENCE:
             note = (
                 "receive times are converted to boot time with a line fitted to the least delayed "
                 "messages"
@@ -361,12 +363,12 @@ def describe_clock_conversions(
             ClockMap(
                 clock="receive time (UNIX time of the recording computer)",
                 method="receive time",
-                pairs=receipt_to_boot_fit.reading_pair_count,
-                offset_s=receipt_to_boot_fit.y0
-                - receipt_to_boot_fit.x0
+                pairs=receive_to_boot_time_fit.reading_pair_count,
+                offset_s=receive_to_boot_time_fit.y0
+                - receive_to_boot_time_fit.x0
                 - float(receive_times_us[0]) * 1e-6,
-                drift_ppm=(receipt_to_boot_fit.slope - 1.0) * 1e6,
-                jitter_s=receipt_to_boot_fit.jitter_s,
+                drift_ppm=(receive_to_boot_time_fit.slope - 1.0) * 1e6,
+                jitter_s=receive_to_boot_time_fit.jitter_s,
                 note=note,
             )
         )

@@ -18,7 +18,7 @@ from px4fuse.core.arrays import Array, IntArray, compute_median_interval_s
 from px4fuse.core.reading import read_bytes_limited, split_path_and_part
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight.model import NO_INVALID_ROWS, time_index
-from px4fuse.readers.common import classify_invalid_positions, estimate_rounding_step
+from px4fuse.readers.common import classify_invalid_positions, estimate_quantisation_step
 from px4fuse.readers.position_names import (
     METRES_BY_LENGTH_UNIT,
     SECONDS_BY_TIME_UNIT,
@@ -44,7 +44,7 @@ from px4fuse.readers.recording_table import (
     refuse_foreign_format,
 )
 from px4fuse.readers.ros_bag import is_bag, read_bag
-from px4fuse.readers.ulog_topics import longest_increasing_run
+from px4fuse.readers.ulog_topics import find_longest_increasing_subsequence
 
 SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
 SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
@@ -90,7 +90,7 @@ class PositionRecording:
     # Reason for each row without a valid position
     reason_by_invalid_row: "pd.Series[str]" = field(default_factory=lambda: NO_INVALID_ROWS)
     # Quantisation step of the horizontal position; 0 if not quantised
-    rounding_step_m: float = 0.0
+    quantisation_step_m: float = 0.0
     # Name of the format; "" for a table with a header
     format: str = ""
     # Number of rows with the selected rigid body or UWB tag
@@ -141,36 +141,36 @@ def read_position_file(
     if columns:
         column_meanings = _interpret_given_columns(table, column_meanings, columns)
     quaternion_columns = find_quaternion_columns(table.column_names)
-    numbers, has_time_zone = _read_numbers(table, column_meanings, quaternion_columns, body)
-    row_count = len(numbers)
-    time_column, time_text = _detect_time_column(table, column_meanings, numbers)
-    frame, axis_columns = _find_axes(column_meanings, numbers)
+    numeric_table, has_time_zone = _read_numbers(table, column_meanings, quaternion_columns, body)
+    row_count = len(numeric_table)
+    time_column, time_text = _detect_time_column(table, column_meanings, numeric_table)
+    frame, axis_columns = _find_axes(column_meanings, numeric_table)
     sigma_columns = find_sigma_columns(column_meanings, frame)
     position_columns = [index for index in axis_columns if index is not None]
     # pandas reads numbers such as 1e999 as infinite
-    has_time = np.isfinite(numbers[time_column])
-    is_usable = has_time & (numbers[position_columns].abs() < MAX_COORDINATE_IN_FILE_UNIT).all(
-        axis=1
-    )
+    has_time = np.isfinite(numeric_table[time_column])
+    is_usable = has_time & (
+        numeric_table[position_columns].abs() < MAX_COORDINATE_IN_FILE_UNIT
+    ).all(axis=1)
     if unusable_count := np.count_nonzero(~is_usable):
         notes.append(
             f"number of dropped rows without valid time or position: {unusable_count}"
-            f"{table.format_first_line_number(numbers.index[~is_usable])}"
+            f"{table.format_first_line_number(numeric_table.index[~is_usable])}"
         )
-    times_without_position = numbers.loc[has_time & ~is_usable, time_column].to_numpy()
-    numbers = numbers[is_usable]
+    times_without_position = numeric_table.loc[has_time & ~is_usable, time_column].to_numpy()
+    numeric_table = numeric_table[is_usable]
     time_units, min_interval_s, max_interval_s = TRAJECTORY_TIMES if is_trajectory else UWB_TIMES
     unit, unit_text = "frame numbers", f"the frame rate is {table.rate_hz or 0:g} Hz"
     if table.rate_hz is None:
         unit, unit_text = _choose_time_unit(
-            numbers[time_column],
+            numeric_table[time_column],
             column_meanings[time_column].unit,
             time_unit,
             time_units,
             (min_interval_s, max_interval_s),
         )
     units_per_second = table.rate_hz or round(1.0 / SECONDS_BY_TIME_UNIT[unit])
-    times_s = numbers[time_column].to_numpy() / units_per_second
+    times_s = numeric_table[time_column].to_numpy() / units_per_second
     kept_rows = _find_increasing_rows(times_s)
     if dropped_count := len(times_s) - len(kept_rows):
         notes.append(
@@ -190,25 +190,25 @@ def read_position_file(
             "Write numbers with decimal points. Alternatively, name the columns with "
             f"{COLUMNS_OPTION}.",
         )
-    numbers = numbers.iloc[kept_rows].set_index(time_index(times_s[kept_rows]))
-    median_interval_s = compute_median_interval_s(numbers.index)
+    numeric_table = numeric_table.iloc[kept_rows].set_index(time_index(times_s[kept_rows]))
+    median_interval_s = compute_median_interval_s(numeric_table.index)
     if not min_interval_s <= median_interval_s <= max_interval_s:
         notes.append(
             f"a median interval of {median_interval_s:.3g} s is unusual: check the unit of time "
             "(--position-time-unit)"
         )
     metres_per_unit, length_unit_text = _choose_length_units(
-        numbers,
+        numeric_table,
         position_columns,
         column_meanings,
         length_unit,
         np.inf if is_trajectory else MAX_INDOOR_EXTENT_M,
     )
     columns_m = {
-        name: np.nan if index is None else numbers[index] * metres_per_unit[index]
+        name: np.nan if index is None else numeric_table[index] * metres_per_unit[index]
         for name, index in zip(SAMPLE_COLUMNS, (*axis_columns, *sigma_columns), strict=True)
     }
-    samples = pd.DataFrame(columns_m, index=numbers.index).replace([np.inf, -np.inf], np.nan)
+    samples = pd.DataFrame(columns_m, index=numeric_table.index).replace([np.inf, -np.inf], np.nan)
     invalid_reasons = classify_invalid_positions(samples, SAMPLE_COLUMNS[: len(position_columns)])
     is_valid = (invalid_reasons == "") | is_trajectory
     samples = samples[is_valid]
@@ -219,7 +219,7 @@ def read_position_file(
     clock_kind: Literal["UNIX", "local"] = (
         "UNIX"
         if has_time_zone
-        and MIN_VALID_UNIX_TIME_S <= np.median(numbers.index) < MAX_VALID_UNIX_TIME_S
+        and MIN_VALID_UNIX_TIME_S <= np.median(numeric_table.index) < MAX_VALID_UNIX_TIME_S
         else "local"
     )
     return PositionRecording(
@@ -251,11 +251,11 @@ def read_position_file(
         ).sort_index(),
         format=table.format,
         row_count=row_count,
-        quaternions=numbers.loc[is_valid, quaternion_columns].to_numpy()
+        quaternions=numeric_table.loc[is_valid, quaternion_columns].to_numpy()
         if quaternion_columns
         else None,
-        rounding_step_m=max(
-            estimate_rounding_step(samples[name].to_numpy()) for name in ("x_m", "y_m")
+        quantisation_step_m=max(
+            estimate_quantisation_step(samples[name].to_numpy()) for name in ("x_m", "y_m")
         ),
     )
 
@@ -277,9 +277,9 @@ def _open_table(
 def _find_increasing_rows(times_s: Array) -> IntArray:
     """Return the indices of the rows with strictly increasing times before 2100."""
     usable_rows = np.flatnonzero(np.abs(times_s) < MAX_VALID_UNIX_TIME_S)
-    # Ranks, because longest_increasing_run requires positive values
+    # Ranks, because find_longest_increasing_subsequence requires positive values
     time_ranks = np.unique(times_s[usable_rows], return_inverse=True)[1].astype(np.int64)
-    return usable_rows[longest_increasing_run(time_ranks + 1)]
+    return usable_rows[find_longest_increasing_subsequence(time_ranks + 1)]
 
 
 def _check_options(
@@ -314,22 +314,22 @@ def _read_numbers(
     texts = table.read_cells([*quaternion_columns, *known_columns])
     texts = _select_body(table, texts, column_meanings, body_name)
     # DataFrame.apply returns dtype object for an empty table
-    numbers = texts.apply(_to_numbers, may_have_decimal_comma=table.separator != ",").astype(
+    numeric_table = texts.apply(_to_numbers, may_have_decimal_comma=table.separator != ",").astype(
         np.float64
     )
     has_time_zone = True
     for index, meaning in enumerate(column_meanings):
         if (
             meaning.kind == "time"
-            and numbers[index].isna().mean() > 0.5
+            and numeric_table[index].isna().mean() > 0.5
             and texts[index].notna().any()
         ):
             dates = texts[index].str.replace(",", ".", regex=False)
             times = pd.to_datetime(dates, format="ISO8601", utc=True, errors="coerce")
-            numbers[index] = (times - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
+            numeric_table[index] = (times - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
             has_time_zone = bool(dates.str.contains(r"(?:Z|[+-]\d\d:?\d\d)$").mean() > 0.5)
             column_meanings[index] = replace(meaning, unit="s")
-    return numbers, has_time_zone
+    return numeric_table, has_time_zone
 
 
 def _to_numbers(texts: "pd.Series[str]", *, may_have_decimal_comma: bool) -> "pd.Series[float]":
@@ -415,27 +415,27 @@ def _interpret_given_columns(
 
 
 def _find_axes(
-    column_meanings: Sequence[ColumnMeaning], numbers: pd.DataFrame
+    column_meanings: Sequence[ColumnMeaning], numeric_table: pd.DataFrame
 ) -> tuple[str | None, PositionColumns]:
     """Return the frame of the position (None: unknown), and the column indices of its axes."""
     frame_and_axis_columns = find_position_columns(column_meanings)
     assert frame_and_axis_columns  # find_table returns only tables with positions
     frame, (x_column, y_column, z_column) = frame_and_axis_columns
-    if z_column is not None and numbers[z_column].isna().all():
+    if z_column is not None and numeric_table[z_column].isna().all():
         z_column = None
     return frame, (x_column, y_column, z_column)
 
 
 def _detect_time_column(
-    table: PositionTable, column_meanings: Sequence[ColumnMeaning], numbers: pd.DataFrame
+    table: PositionTable, column_meanings: Sequence[ColumnMeaning], numeric_table: pd.DataFrame
 ) -> tuple[int, str]:
     """Return the index of the time column, and its name for notes.
 
     The time of measurement is preferred to the time of recording. If the time column contains whole
-    seconds, the nanoseconds of another column are added to it in ``numbers``.
+    seconds, the nanoseconds of another column are added to it in ``numeric_table``.
     """
     time_columns = [index for index, column in enumerate(column_meanings) if column.kind == "time"]
-    is_mostly_empty = numbers[time_columns].fillna(0.0).eq(0.0).mean() >= 0.5
+    is_mostly_empty = numeric_table[time_columns].fillna(0.0).eq(0.0).mean() >= 0.5
     time_column, *other_time_columns = sorted(
         time_columns,
         key=lambda index: (
@@ -448,10 +448,10 @@ def _detect_time_column(
     for index in [*other_time_columns]:
         if (
             column_meanings[index].unit == "ns"
-            and (numbers[time_column] % 1.0 == 0.0).mean() > MIN_MATCHING_ROW_FRACTION
-            and numbers[index].max() < 1e9
+            and (numeric_table[time_column] % 1.0 == 0.0).mean() > MIN_MATCHING_ROW_FRACTION
+            and numeric_table[index].max() < 1e9
         ):
-            numbers[time_column] += numbers[index] * 1e-9
+            numeric_table[time_column] += numeric_table[index] * 1e-9
             other_time_columns.remove(index)
             time_text += f" plus {table.format_labels(index)}"
     if other_time_columns:
@@ -499,7 +499,7 @@ def _choose_time_unit(
 
 
 def _choose_length_units(
-    numbers: pd.DataFrame,
+    numeric_table: pd.DataFrame,
     position_columns: list[int],
     column_meanings: Sequence[ColumnMeaning],
     given_unit: str | None,
@@ -515,7 +515,9 @@ def _choose_length_units(
         if meaning.unit in METRES_BY_LENGTH_UNIT
     }
     # The range from 5 % to 95 % excludes outliers
-    extents = numbers[position_columns].quantile(0.95) - numbers[position_columns].quantile(0.05)
+    extents = numeric_table[position_columns].quantile(0.95) - numeric_table[
+        position_columns
+    ].quantile(0.05)
     max_extent = extents.max()
     unit = "m"
     reason = "px4fuse assumes metres, because the column names contain no unit"
@@ -532,7 +534,7 @@ def _choose_length_units(
             "cm, give --position-unit"
         )
     column_units = pd.Series(
-        {index: named_units.get(index, unit) for index in map(int, numbers.columns)}
+        {index: named_units.get(index, unit) for index in map(int, numeric_table.columns)}
     )
     metres_per_unit = column_units.map(METRES_BY_LENGTH_UNIT)
     extent_m = (extents * metres_per_unit).max()

@@ -55,7 +55,7 @@ class ColumnMeaning:
         "time", "position", "sigma" or "tag" (number of a UWB tag).
     axis : str
         Axis of a position or sigma, such as "x" or "north".
-    group : str
+    name_without_axis_and_unit : str
         Column name without axis and unit.
     time_kind : str
         Kind of a time, for example "time of measurement".
@@ -64,7 +64,7 @@ class ColumnMeaning:
     kind: str = ""
     axis: str = ""
     unit: str = ""
-    group: str = ""
+    name_without_axis_and_unit: str = ""
     time_kind: str = ""
 
 
@@ -116,12 +116,13 @@ def find_position_columns(
 
     Return None if no column contains a position.
     """
-    columns_by_group: dict[str, dict[str, int]] = {}
+    columns_by_name: dict[str, dict[str, int]] = {}
     for index, column in enumerate(column_meanings):
         if column.kind == "position":
-            columns_by_group.setdefault(column.group, {}).setdefault(column.axis, index)
+            columns_by_axis = columns_by_name.setdefault(column.name_without_axis_and_unit, {})
+            columns_by_axis.setdefault(column.axis, index)
     for axis_count in (3, 2):
-        for axes in columns_by_group.values():
+        for axes in columns_by_name.values():
             # x, y, z, w is a quaternion
             for frame, names in () if "w" in axes else _AXIS_NAMES_BY_FRAME:
                 if {*names[:axis_count]} <= axes.keys():

@@ -367,8 +367,8 @@ def _read_fusion_record(
     vision_delay_s = _compute_publication_delay_s(topics, VISION_TOPIC).sort_index()
     return FusionRecord(
         parameters=topics.ekf2_parameters,
-        delayed=usable_state,
-        stores_bias_increments=attitude_variance_count == QUATERNION_VARIANCE_COUNT,
+        delayed_state=usable_state,
+        has_delta_angle_biases=attitude_variance_count == QUATERNION_VARIANCE_COUNT,
         other_horizontal_aids=tuple(
             AIDS[name].label.replace("external vision,", "vision")
             for name in OTHER_HORIZONTAL_AIDS

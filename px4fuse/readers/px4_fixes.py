@@ -6,7 +6,7 @@ import pandas as pd
 from px4fuse.core.arrays import Array, rms
 from px4fuse.flight.model import Columns, Ekf2, Unavailable, time_index
 from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.common import interpolate_inside
+from px4fuse.readers.common import interpolate_inside_time_span
 from px4fuse.readers.px4_innovations import replace_vision_by_gnss_innovations
 from px4fuse.readers.ulog_topics import Topics
 
@@ -17,7 +17,7 @@ MAX_DIFFERENCE_FROM_LOGGED_LATITUDE_DEG = 1.0
 # Possible intervals (s) between the fixes of a GNSS receiver: 4 to 20 fixes per second
 CANDIDATE_FIX_INTERVALS_S = np.arange(0.05, 0.26, 0.0005)
 # Maximum deviation (s) of a logged interval from a multiple of the receiver's interval
-MAX_DEVIATION_FROM_MULTIPLE_S = 0.006
+MAX_DEVIATION_FROM_INTERVAL_MULTIPLE_S = 0.006
 # Minimum number of logged fixes to measure the error of the reconstruction
 MIN_LOGGED_FIXES = 10
 # The receiver's interval is known if two successive multiples of it each occur at least this number
@@ -47,9 +47,11 @@ def read_unlogged_fixes(
     fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
     next_row = np.clip(np.searchsorted(logged_fixes.index, fixes.index), 1, len(logged_fixes) - 1)
     times_s, logged_times_s = fixes.index.to_numpy(), logged_fixes.index.to_numpy()
-    distance_s = np.abs(logged_times_s[[next_row - 1, next_row]] - times_s).min(axis=0)
+    time_difference_to_logged_fix_s = np.abs(
+        logged_times_s[[next_row - 1, next_row]] - times_s
+    ).min(axis=0)
     is_between_fixes = (times_s > logged_times_s[0]) & (times_s < logged_times_s[-1])
-    is_logged = distance_s <= MAX_TIME_DIFFERENCE_OF_SAME_FIX_S
+    is_logged = time_difference_to_logged_fix_s <= MAX_TIME_DIFFERENCE_OF_SAME_FIX_S
     # Before v1.16, the topic contains a local position (m), no latitude and longitude
     is_in_degrees = (
         fixes["latitude_deg"][is_logged].sub(logged_fixes["latitude_deg"].median()).abs().median()
@@ -108,7 +110,7 @@ def reconstruct_fixes(
     )
     reconstructed_fixes = pd.DataFrame(
         {
-            column: interpolate_inside(
+            column: interpolate_inside_time_span(
                 reconstructed_fix_times_s + delay_beyond_horizon_s, ekf2.state[column]
             )
             + innovations["innovation_m"].to_numpy()[has_unique_fix]
@@ -149,7 +151,7 @@ def _estimate_receiver_interval(fix_times_s: Array) -> float | None:
     multiples = np.divide.outer(logged_intervals_s, CANDIDATE_FIX_INTERVALS_S)
     deviation_from_multiple_s = np.abs(multiples - np.round(multiples)) * CANDIDATE_FIX_INTERVALS_S
     percentile_98_of_deviation_s = np.percentile(deviation_from_multiple_s, 98, axis=0)
-    is_possible = percentile_98_of_deviation_s <= MAX_DEVIATION_FROM_MULTIPLE_S
+    is_possible = percentile_98_of_deviation_s <= MAX_DEVIATION_FROM_INTERVAL_MULTIPLE_S
     if not np.any(is_possible):
         return None
     longest_interval_s = CANDIDATE_FIX_INTERVALS_S[is_possible][-1]
@@ -159,9 +161,9 @@ def _estimate_receiver_interval(fix_times_s: Array) -> float | None:
     )
     best_index = np.argmin(np.where(is_near_longest, percentile_98_of_deviation_s, np.inf))
     interval_multiples = np.round(logged_intervals_s / CANDIDATE_FIX_INTERVALS_S[best_index])
-    is_frequent_multiple = (
+    has_enough_intervals_by_multiple = (
         np.bincount(interval_multiples.astype(int)) >= MIN_LOGGED_INTERVALS_PER_MULTIPLE
     )
-    if not np.any(is_frequent_multiple[1:] & is_frequent_multiple[:-1]):
+    if not np.any(has_enough_intervals_by_multiple[1:] & has_enough_intervals_by_multiple[:-1]):
         return None
     return float(np.median(logged_intervals_s / interval_multiples))

@@ -27,8 +27,8 @@ from px4fuse.flight.model import (
 )
 from px4fuse.readers.common import (
     classify_invalid_positions,
-    estimate_rounding_step,
-    interpolate_inside,
+    estimate_quantisation_step,
+    interpolate_inside_time_span,
     join_nearest,
     read_attitude,
     read_orientation,
@@ -141,8 +141,8 @@ def make_track(
     """
     status_samples = samples[[name for name in POSITION_STATUS_COLUMNS if name in samples]]
     samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
-    rounding_step_m = max(
-        estimate_rounding_step(samples[name].to_numpy()) for name in needed_columns[:2]
+    quantisation_step_m = max(
+        estimate_quantisation_step(samples[name].to_numpy()) for name in needed_columns[:2]
     )
     is_number = samples[Columns.POSITION].notna().any()
     if origin.is_gnss:  # a receiver at rest may repeat its position
@@ -166,7 +166,7 @@ def make_track(
         samples=samples.assign(**variance.where(variance > 0)),
         origin=origin,
         status=status_samples,
-        rounding_step_m=rounding_step_m,
+        quantisation_step_m=quantisation_step_m,
         **track_fields,
     )
 
@@ -177,12 +177,12 @@ def _make_ulog_track(
     samples: pd.DataFrame,
     topic_names: tuple[str, ...],
     *,
-    is_auto_candidate: bool = True,
+    is_selectable_by_default: bool = True,
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
     """Make a position track of a source that is defined in ``px4_topics.toml``."""
     source = TRACK_SOURCES[name]
-    origin = structs.replace(source.origin, is_auto_candidate=is_auto_candidate)
+    origin = structs.replace(source.origin, is_selectable_by_default=is_selectable_by_default)
     if origin.aid is not None:
         lever_arm_m = tuple(topics.ekf2_parameters.get(name, 0.0) for name in origin.aid.lever_arm)
         track_fields = {"lever_arm_m": lever_arm_m, **track_fields}
@@ -333,7 +333,7 @@ def _reconstruct_track(
         return unavailable_source(RECONSTRUCTED_TRACK_NAME, "the log contains no EKF2 state")
     positions = {
         column: innovations["innovation_m"]
-        + interpolate_inside(innovations.index, ekf2.state[column])
+        + interpolate_inside_time_span(innovations.index, ekf2.state[column])
         for column, innovations in zip(Columns.POSITION, ekf2.innovations.values(), strict=True)
         if isinstance(innovations, pd.DataFrame)
     }
@@ -488,7 +488,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         notes=tuple(notes),
         velocity=samples[Columns.VELOCITY + Columns.VELOCITY_VARIANCE],
         assumed_delay_s=delay_s,
-        is_auto_candidate=has_fused_aid(ekf2),
+        is_selectable_by_default=has_fused_aid(ekf2),
         invalid_reasons=pd.Series("no fix", time_index(times_without_fix_s), dtype=object),
         **track_fields,
     )
@@ -540,7 +540,9 @@ def read_truth(
         if has_fused_aid(ekf2):
             local_samples = local_samples.copy()
             for column in Columns.POSITION:  # both frames differ by a constant
-                local_truth_m = interpolate_inside(projected_positions.index, local_samples[column])
+                local_truth_m = interpolate_inside_time_span(
+                    projected_positions.index, local_samples[column]
+                )
                 shift_m = (projected_positions[column] - local_truth_m).median()
                 local_samples[column] += np.nan_to_num(shift_m)
     if len(local_samples):

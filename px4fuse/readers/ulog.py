@@ -29,7 +29,7 @@ from px4fuse.readers.px4_topics import (
 from px4fuse.readers.ulog_topics import (
     Topics,
     describe_dropped_samples,
-    longest_increasing_run,
+    find_longest_increasing_subsequence,
     read_topics,
 )
 
@@ -153,7 +153,9 @@ def _read_imu(topics: Topics) -> pd.DataFrame:
     if (offset_us := columns.pop("accelerometer_offset_us", None)) is not None:
         rows = np.flatnonzero(offset_us != INVALID_ACCELEROMETER_OFFSET_US)
         time_us = np.rint(time_s[rows] * 1e6 + offset_us[rows])
-        kept_rows = longest_increasing_run(time_us.astype(np.int64) + topics.time_origin_us)
+        kept_rows = find_longest_increasing_subsequence(
+            time_us.astype(np.int64) + topics.time_origin_us
+        )
         time_s, rows = time_us[kept_rows] * 1e-6, rows[kept_rows]
     for name in Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE:
         is_valid = np.abs(columns[name][rows]) < common.MAX_IMU_READING

@@ -52,7 +52,7 @@ NOTE_KEY = "px4fuse_note"
 # ULog info message that marks a student assignment
 ASSIGNMENT_FLAG_KEY = "px4fuse_assessed"
 # True for commands of instructors, which show the diagnosis of an assignment
-ignores_assignment_flag = ContextVar("ignores_assignment_flag", default=False)
+shows_diagnosis_of_assignments = ContextVar("shows_diagnosis_of_assignments", default=False)
 # Maximum interval (s) between valid IMU timestamps
 MAX_DATA_GAP_S = 600.0
 # Maximum number of fields of all topics, to limit the memory; real logs have 3,300
@@ -105,7 +105,7 @@ def _read_samples(parser: ULog, content: bytes, start: int) -> int:
 
     pyulog reads the other messages. It would also read samples, but in twice the time.
     """
-    subscriptions, ignored_numbers = parser._subscriptions, parser._filtered_message_ids
+    subscriptions, ignored_message_ids = parser._subscriptions, parser._filtered_message_ids
     last_time_us = parser._last_timestamp
     while start <= len(content) - SAMPLE_HEADER.size:
         size, message_type, number = SAMPLE_HEADER.unpack_from(content, start)
@@ -121,7 +121,7 @@ def _read_samples(parser: ULog, content: bytes, start: int) -> int:
             (time_us,) = TIME.unpack_from(content, time_start)
             if time_us > last_time_us:  # noqa: PLR1730 (max is slower)
                 last_time_us = time_us
-        elif number not in ignored_numbers:
+        elif number not in ignored_message_ids:
             break
         start = end
     parser._last_timestamp = last_time_us
@@ -258,7 +258,7 @@ class Topics:
             if field_name in table
         }
         time_us = measurement_time_us(table)
-        kept_rows = longest_increasing_run(time_us)
+        kept_rows = find_longest_increasing_subsequence(time_us)
         if len(kept_rows) < len(time_us):
             self.dropped[layout.topic] = len(time_us) - len(kept_rows)
         values = np.empty((len(fields), len(kept_rows)))
@@ -292,11 +292,11 @@ class Topics:
             return _empty_frame(layout)
         if self.primary_instances == NO_INSTANCE_SWITCHES:
             return select_rows(self.read_instance(layout))
-        primary_number = pd.Series(dict(self.primary_instances), dtype=np.float64)
+        primary_instance_number = pd.Series(dict(self.primary_instances), dtype=np.float64)
         instance_tables: list[pd.DataFrame] = []
         for number in self.instances(layout.topic):
             samples = select_rows(self.read_instance(layout, number))
-            is_primary = sample_step_function(primary_number, samples.index) == number
+            is_primary = sample_step_function(primary_instance_number, samples.index) == number
             instance_tables.append(samples[is_primary])
         joined_tables = pd.concat(instance_tables).sort_index()
         return joined_tables[~joined_tables.index.duplicated()]
@@ -338,7 +338,7 @@ def measurement_time_us(table: TopicArrays) -> NDArray[np.int64]:
     return np.where(is_plausible, sample_timestamps_us, published_us)
 
 
-def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
+def find_longest_increasing_subsequence(time_us: NDArray[np.int64]) -> IntArray:
     """Return the indices of the longest strictly increasing subsequence of positive timestamps.
 
     Do not use a running maximum: a single late timestamp would remove all samples after it.
@@ -438,7 +438,7 @@ def read_topics(name: str, content: bytes) -> Topics:
         autopilot=_read_printable_text(info, "sys_name", "PX4"),
         vehicle=_read_printable_text(info, "sys_uuid", ""),
         is_assessed=True
-        if ASSIGNMENT_FLAG_KEY in info and not ignores_assignment_flag.get()
+        if ASSIGNMENT_FLAG_KEY in info and not shows_diagnosis_of_assignments.get()
         else UNSET,
     )
     return Topics(
@@ -508,7 +508,7 @@ def _find_data_span_us(tables: Tables, name: str) -> tuple[int, int]:
         tables, key=lambda key: (key[0] != IMU_LAYOUT.topic, -len(tables[key]["timestamp"]))
     ):
         time_us = tables[key]["timestamp"].astype(np.int64)
-        increasing_times_us = time_us[longest_increasing_run(time_us)]
+        increasing_times_us = time_us[find_longest_increasing_subsequence(time_us)]
         if len(increasing_times_us):
             # Use the longest part without a gap, because invalid timestamps may be hours away
             gap_rows = (

@@ -34,7 +34,7 @@ def draw_pages(analysis: Analysis | AidingSourceAnalysis, _: object) -> Iterator
     if aids:
         page = Page(f"{title} of EKF2", LEAD_TEXT)
         write_aids(page, aids)
-        page.write_small_text(VERDICT_LEGEND)
+        page.write_muted_text(VERDICT_LEGEND)
         _draw_aid_panels(page, analysis.flight, aids)
         yield page
 
@@ -81,7 +81,7 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
     column_heads += ["axis", "n", "mean\nNIS", "95 %\nband", "mean\nν/√S"]
     page.add_table(column_heads, rows, right_aligned_columns=(2, 3, 4, 5, 7, 8, 10))
     if disabled_labels := [aid.label for aid in aids.values() if aid.verdict == "disabled"]:
-        page.write_small_text(
+        page.write_muted_text(
             f"Aiding sources that are logged but never fused: {', '.join(disabled_labels)}."
         )
 
@@ -101,7 +101,7 @@ def _draw_aid_panels(page: Page, flight: Flight, aids: Mapping[str, AidResult]) 
     ):
         return
     page.write_heading("Normalised innovations of each aiding source")
-    page.write_small_text(
+    page.write_muted_text(
         "95 % of the normalised innovations ν/√S are expected within ±2 (lines). Hollow samples "
         "were not fused. Grey: fusion was disabled. Triangles: values beyond "
         f"±{MAX_DRAWN_SIGMAS:g}."

@@ -214,14 +214,14 @@ def draw_sigma_ratio(ratio: float | None, reference: Reference) -> str:
     '1/10 ─────────────░░░░░░░────────────▶ 10'
     """
     first_band_column, last_band_column = (
-        _compute_axis_column(end) for end in CONSISTENT_SIGMA_RATIOS[reference]
+        _map_ratio_to_character_column(end) for end in CONSISTENT_SIGMA_RATIOS[reference]
     )
     characters = [
         "░" if first_band_column <= column <= last_band_column else "─"
         for column in range(AXIS_WIDTH)
     ]
     if ratio is not None:
-        column, last_column = _compute_axis_column(ratio), AXIS_WIDTH - 1
+        column, last_column = _map_ratio_to_character_column(ratio), AXIS_WIDTH - 1
         symbol = (
             "◀" if column < 0 else "▶" if column > last_column else SYMBOL_BY_REFERENCE[reference]
         )
@@ -244,7 +244,7 @@ def locate_sigma_ratio(
     }
 
 
-def _compute_axis_column(ratio: float) -> int:
+def _map_ratio_to_character_column(ratio: float) -> int:
     return round(map_ratio_to_axis(ratio) * (AXIS_WIDTH - 1))
 
 
@@ -408,7 +408,7 @@ def _format_tick_labels() -> str:
     characters = [" "] * AXIS_WIDTH
     for tick in LABELLED_RATIO_TICKS[1:-1]:
         label = RATIO_AXIS_TICKS[tick]
-        start = _compute_axis_column(tick) - len(label) // 2
+        start = _map_ratio_to_character_column(tick) - len(label) // 2
         characters[start : start + len(label)] = label
     return f"{'':5}{''.join(characters).rstrip()}"
 

@@ -8,7 +8,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.remedy import (
     describe_delay_limit,
-    estimate_differing_delay_ms,
+    estimate_delay_if_not_as_logged_ms,
     find_aid,
     find_delay_max_change,
     find_logged_delay_ms,
@@ -134,7 +134,7 @@ def _format_delay_advice(
     comparison: PreparedComparison, time_offset: SourceTimeOffset, logged_delay_ms: float
 ) -> str:
     delay_parameter = find_aid(comparison).delay
-    fitted_delay_ms = estimate_differing_delay_ms(comparison, time_offset, logged_delay_ms)
+    fitted_delay_ms = estimate_delay_if_not_as_logged_ms(comparison, time_offset, logged_delay_ms)
     if fitted_delay_ms is None:
         return f"{delay_parameter} {logged_delay_ms:g} ms agrees with the estimated time offset."
     if limit_text := describe_delay_limit(delay_parameter, fitted_delay_ms, logged_delay_ms):
@@ -175,7 +175,10 @@ def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]
 def _draw_likelihood(axes: Axes, time_offset: SourceTimeOffset) -> None:
     """Draw the log-likelihood of the positions over the time offset."""
     low_s, high_s = time_offset.interval_s
-    offsets_s, drops = time_offset.curve_time_offsets_s, time_offset.curve_log_likelihood_drops
+    offsets_s, drops = (
+        time_offset.likelihood_curve_offsets_s,
+        time_offset.curve_log_likelihood_drops,
+    )
     is_near = np.abs(offsets_s - time_offset.offset_s) <= CURVE_TO_INTERVAL_RATIO * (high_s - low_s)
     axes.axvspan(low_s, high_s, color=KF_BAND_COLOUR, lw=0, label="95 % interval")
     axes.plot(offsets_s[is_near], drops[is_near], **TRACK_STYLES["KF"])

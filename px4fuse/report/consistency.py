@@ -23,7 +23,7 @@ from px4fuse.filter.consistency import (
     compute_nis_band,
 )
 from px4fuse.filter.tuning import AxisTuning
-from px4fuse.findings.cause_text import describe_explained_part, format_change
+from px4fuse.findings.cause_text import describe_part_explained_by_change, format_change
 from px4fuse.flight.model import Unavailable
 from px4fuse.report.page import Page, draw_legend_above, make_columns
 from px4fuse.report.panels import add_time_panel, normalised_innovations
@@ -87,7 +87,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
         for name, consistency in get_statistics_by_filter(axis_result).items()
     ]
     page.add_table(column_heads, rows, right_aligned_columns=(2, 5, 6, 7, 8))
-    page.write_small_text(VERDICT_LEGEND)
+    page.write_muted_text(VERDICT_LEGEND)
     noise_rows = [
         [name, *map(format_noise_estimate, (tuning.sigma_a_two_state, tuning.sigma_z))]
         for name, tuning in analysis.tuning.items()
@@ -108,13 +108,13 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
             cells = [FILTER_NAMES[filter_name], format_change(analysis, rerun), label]
             for outcome in (rerun.before, rerun.after):
                 cells.append(format_number((outcome.value(statistic) or 0.0) ** exponent, 2))
-            rows.append([*cells, describe_explained_part(rerun, statistic)])
+            rows.append([*cells, describe_part_explained_by_change(rerun, statistic)])
     if not rows:
         return
     page.write_heading(f"Tested causes of inconsistent filters along {axis.label}")
     column_heads = ["filter", "change", "quantity", "as flown", "with change", "explains"]
     page.add_table(column_heads, rows, right_aligned_columns=(3, 4))
-    page.write_small_text(
+    page.write_muted_text(
         "Each row is a re-run with one change. 'explains': relative reduction of ln(mean NIS) or "
         "ln(mean NEES); 'all': the filter becomes consistent. A change that explains 50 % or more "
         "is a cause."
@@ -137,9 +137,11 @@ def _draw_running_nis(axes: Axes, innovations: InnovationsByFilter) -> None:
     for name, values in innovations.items():
         running_nis = (values**2).expanding(MIN_INNOVATIONS).mean().dropna()
         draw_curve(axes, running_nis, **TRACK_STYLES[name], label=name)
-        band_counts = np.unique(np.geomspace(MIN_INNOVATIONS, len(values), 60).astype(int))
-        band_low, band_high = np.array([compute_nis_band(int(count)) for count in band_counts]).T
-        band_times_s = values.index[band_counts - 1]
+        innovation_counts = np.unique(np.geomspace(MIN_INNOVATIONS, len(values), 60).astype(int))
+        band_low, band_high = np.array(
+            [compute_nis_band(int(count)) for count in innovation_counts]
+        ).T
+        band_times_s = values.index[innovation_counts - 1]
         axes.plot(band_times_s, band_low, **_thin_line_style(name))
         axes.plot(band_times_s, band_high, **_thin_line_style(name), label=f"95 % band {name}")
     axes.axhline(1.0, color="black", lw=0.5)

@@ -46,8 +46,8 @@ from px4fuse.report.card_text import (
 from px4fuse.report.page import (
     AXES_LEFT_MARGIN,
     AXES_RIGHT_MARGIN,
-    LABELLED_HEIGHT,
-    UNLABELLED_HEIGHT,
+    LABELLED_BOTTOM_MARGIN,
+    UNLABELLED_BOTTOM_MARGIN,
     Page,
     PageBlock,
     make_columns,
@@ -163,7 +163,7 @@ def _make_aid_row(aid: AidConsistency) -> dict[str, Any]:
 
 def _make_ratio_row(
     ratio: float | None,
-    reference: Reference = "source",
+    reference_of_actual_error: Reference = "source",
     interval: tuple[float, float] | None = None,
     **fields: str | bool,
 ) -> dict[str, Any]:
@@ -171,7 +171,7 @@ def _make_ratio_row(
         return {"ratio": "", **fields}
     return {
         "ratio": format_ratio(ratio),
-        **locate_sigma_ratio(ratio, reference, interval),
+        **locate_sigma_ratio(ratio, reference_of_actual_error, interval),
         **fields,
     }
 
@@ -225,9 +225,9 @@ def _draw_plots(
     page: Page, analysis: Analysis, plots: Sequence[TimePlot], total_height: float
 ) -> None:
     """Draw plots over time with axes of equal height."""
-    axes_height = (total_height - LABELLED_HEIGHT + UNLABELLED_HEIGHT) / len(plots) - (
-        TITLE_HEIGHT + UNLABELLED_HEIGHT
-    )
+    axes_height = (total_height - LABELLED_BOTTOM_MARGIN + UNLABELLED_BOTTOM_MARGIN) / len(
+        plots
+    ) - (TITLE_HEIGHT + UNLABELLED_BOTTOM_MARGIN)
     for plot in plots:
         axes = add_time_panel(
             page,
@@ -305,13 +305,13 @@ def _make_innovation_plot(result: AxisComparison) -> TimePlot:
     innovations = normalised_innovations(result)
     legend = ", ".join(f"{style.INNOVATION_SIGNS[name]} {name}" for name in innovations)
     title = f"Innovations ÷ √S ({legend}): 95 % expected within ±2"
-    clipped_texts = [
+    clipped_value_texts = [
         f"{name} {format_ratio(ratio)}"
         for name, values in innovations.items()
         if (ratio := float(values.abs().max())) > MAX_DRAWN_SIGMAS
     ]
-    if clipped_texts:
-        title += f"; ▲▼ beyond ±{MAX_DRAWN_SIGMAS:g}, largest {', '.join(clipped_texts)}"
+    if clipped_value_texts:
+        title += f"; ▲▼ beyond ±{MAX_DRAWN_SIGMAS:g}, largest {', '.join(clipped_value_texts)}"
 
     def draw(axes: Axes) -> None:
         axes.set(ylim=(-1.12 * MAX_DRAWN_SIGMAS, 1.12 * MAX_DRAWN_SIGMAS), yticks=(-2.0, 2.0))
@@ -348,8 +348,8 @@ def _select_map_tracks(analysis: Analysis) -> dict[str, Array]:
     flight, results = analysis.flight, select_north_and_east(analysis)
 
     def cut_to_flight(table: pd.DataFrame) -> Array:
-        flown = cut_to_segment(table, analysis.segment.whole_flight)
-        return flown[["north_m", "east_m"]].to_numpy().T
+        flight_samples = cut_to_segment(table, analysis.segment.whole_flight)
+        return flight_samples[["north_m", "east_m"]].to_numpy().T
 
     tracks = {"positions": cut_to_flight(analysis.source.samples)}
     for name, label in FILTER_NAMES.items():
@@ -372,7 +372,7 @@ def _draw_map(
     labels: tuple[str, str],
     height: float,
 ) -> None:
-    axes_height = height - TITLE_HEIGHT - LABELLED_HEIGHT
+    axes_height = height - TITLE_HEIGHT - LABELLED_BOTTOM_MARGIN
     axes_width = page.width - AXES_LEFT_MARGIN - AXES_RIGHT_MARGIN
     limits = _compute_map_limits(tracks, axes_width / axes_height)
     distance_m, name = max(

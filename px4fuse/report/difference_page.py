@@ -73,7 +73,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
         draw_curve(axes, difference_m.loc[start:end], **TRACK_STYLES["KF"])
         draw_curve(axes, unexplained_difference_m.loc[start:end], color=EKF2_COLOUR, lw=0.8)
     assert not isinstance(model, Unavailable)
-    page.write_small_text(f"EKF2 replay: {format_replay_agreement(model.agreement)}.")
+    page.write_muted_text(f"EKF2 replay: {format_replay_agreement(model.agreement)}.")
     yield page
 
 

@@ -56,7 +56,7 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     style.set_map_axes(axes, *names)
     worst_index = int(np.argmax(evaluation.position_error_m))
     worst_time_s = evaluation.time_s[worst_index] - _compute_time_origin_s(evaluation)
-    right_column.write_small_text(
+    right_column.write_muted_text(
         f"Darker poses have a larger error; × marks the largest one, at {worst_time_s:.1f} s, "
         f"after {evaluation.distance_m[worst_index]:.1f} m of travel."
     )
@@ -68,7 +68,7 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
         estimate_m = evaluation.unaligned_position_m[:, axis_indices]
         plot_path(axes, estimate_m, evaluation.time_s, label="estimate", color=KF_COLOUR)
         style.set_map_axes(axes, *names)
-        left_column.write_small_text(describe_unaligned_rmse(evaluation))
+        left_column.write_muted_text(describe_unaligned_rmse(evaluation))
         legend_handles += axes.get_legend_handles_labels()[0]
     page.add_legend(legend_handles)
     page.add_columns(*[left_column] * is_aligned, right_column)
@@ -127,7 +127,7 @@ def _draw_rpe(page: Page, evaluation: Evaluation) -> None:
     axes.set_ylim(0.0, max(axes.get_ylim()[1], MIN_ERROR_RANGE_M))
     axes.margins(x=0.1)
     axes.set_xlabel("delta: distance, time or frames between poses")
-    page.write_small_text(describe_rpe_growth(evaluation.rpe))
+    page.write_muted_text(describe_rpe_growth(evaluation.rpe))
 
 
 def plot_path(axes: Axes, positions_m: Array, time_s: Array, **style: Any) -> None:
@@ -166,7 +166,7 @@ def write_evaluation(page: Page, evaluation: Evaluation) -> None:
         for quantity in (ate.interval_m, ate.rotation_deg, *rpe_translations)
         if isinstance(quantity, Unavailable)
     }
-    page.write_small_text(" ".join([*missing_reasons, *evaluation.notes]))
+    page.write_muted_text(" ".join([*missing_reasons, *evaluation.notes]))
 
 
 def _make_error_rows(evaluation: Evaluation) -> list[list[str]]:

@@ -39,7 +39,7 @@ def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
     panels.VELOCITY_SIGMA_PANEL.draw_on_page(page, analysis, result, with_time_label=True)
     _draw_enlarged_sigma_plot(page, result)
     for note in list_verdict_warnings(analysis):
-        page.write_small_text(note)
+        page.write_muted_text(note)
     yield page
 
 
@@ -68,15 +68,15 @@ def _draw_enlarged_sigma_plot(page: Page, result: AxisComparison) -> None:
     axes.set_xlim(start_s, end_s)
     axes.set_xlabel(style.TIME_LABEL)
     if isinstance(ekf2.state, pd.DataFrame):
-        page.write_small_text("EKF2: ▵ before and ▿ after an update, □ logged σ.")
+        page.write_muted_text("EKF2: ▵ before and ▿ after an update, □ logged σ.")
 
 
 def find_zoom_span(result: AxisComparison) -> Span:
     """Return the start and end (s) of a few updates in the middle of the flight."""
-    centre_times_s = update_times_s = result.kf_run.updates.index.to_numpy()
+    candidate_start_times_s = update_times_s = result.kf_run.updates.index.to_numpy()
     if isinstance(innovations := result.ekf2.innovations, pd.DataFrame) and len(innovations):
-        centre_times_s = innovations.index.to_numpy()
-    start_s = float(centre_times_s[len(centre_times_s) // 2])
+        candidate_start_times_s = innovations.index.to_numpy()
+    start_s = float(candidate_start_times_s[len(candidate_start_times_s) // 2])
     interval_s = np.median(np.diff(update_times_s)) if len(update_times_s) > 1 else 0.0
     return start_s, start_s + max(float(ZOOM_UPDATE_COUNT * interval_s), MIN_ZOOM_S)
 
@@ -87,12 +87,14 @@ def _describe_sigma_at_updates(result: AxisComparison) -> str:
         f"{result.kf_run.settings.sigma_a_m_s2:g} m/s²)."
     ]
     for name, filter_summary in get_statistics_by_filter(result).items():
-        before_m = filter_summary.sigma_p_before_update_m
-        after_m = filter_summary.sigma_p_after_update_m
-        if before_m is None or after_m is None:
+        sigma_before_m = filter_summary.sigma_p_before_update_m
+        sigma_after_m = filter_summary.sigma_p_after_update_m
+        if sigma_before_m is None or sigma_after_m is None:
             sentences.append(f"{name}: σ before and after an update is unknown.")
         else:
-            sentences.append(f"{name}: an update reduces σ from {before_m:.3f} to {after_m:.3f} m.")
+            sentences.append(
+                f"{name}: an update reduces σ from {sigma_before_m:.3f} to {sigma_after_m:.3f} m."
+            )
     return " ".join(sentences)
 
 

@@ -26,8 +26,8 @@ def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
         for sender in inventory.flight.log.senders
     ]
     if sender_rows:
-        sender_head = ("sender", "type", "messages", "lost")
-        page.add_table(sender_head, sender_rows, right_aligned_columns=(2, 3))
+        sender_table_head = ("sender", "type", "messages", "lost")
+        page.add_table(sender_table_head, sender_rows, right_aligned_columns=(2, 3))
     head = ("data", "topic", "", "", "", "")
     page.add_table(head, [*_make_source_rows(inventory)], right_aligned_columns=(2, 3, 4, 5))
     possible = "possible:", GOOD_COLOUR

@@ -69,7 +69,7 @@ def _write_page(page: Page, loop: Loop) -> None:
     draw_map(axes, loop)
     page.add_legend(axes.get_legend_handles_labels()[0])
     page.write_heading("Loop closures and RPE")
-    page.write_small_text(
+    page.write_muted_text(
         "d²: squared Mahalanobis distance of the closure error, given drift and closure noise. p: "
         "probability that a true closure has a larger d²; the gate rejects a closure with p below "
         f"{GATE_ALPHA:g}. Weight of GNC (graduated non-convexity): 1 for a used closure, 0 for an "
@@ -137,7 +137,7 @@ def write_loop(page: Page, loop: Loop) -> None:
         if isinstance(correction, Unavailable)
     }
     for reason in missing_reasons:
-        page.write_small_text(reason)
+        page.write_muted_text(reason)
     reference_names = [reference.name for reference in loop.references]
     head = [
         "path",
@@ -159,7 +159,7 @@ def write_loop(page: Page, loop: Loop) -> None:
         ]
         rows.append([path.name, correction_text, *ate_texts])
     page.add_table(head, rows)
-    page.write_small_text(
+    page.write_muted_text(
         "ATE: position RMSE after alignment, with its 95 % interval (block bootstrap)."
         if reference_names
         else "The error of the path is unknown. Add a reference trajectory with --reference FILE."
@@ -204,7 +204,7 @@ def write_closures_and_rpe(page: Page, loop: Loop) -> None:
         if rpe_rows:
             page.add_table(head, rpe_rows)
         for note in notes:
-            page.write_small_text(capitalise_first(note))
+            page.write_muted_text(capitalise_first(note))
 
 
 def _format_span(loop: Loop) -> str:

@@ -23,7 +23,7 @@ LEGEND_HANDLE_WIDTH = 30.0  # points, of the line or symbol of an entry, with it
 LEGEND_CHARACTER_WIDTH = 5.0  # points, more than the mean width in DejaVu Sans of 8 points
 TICK_SPACING = 62.0  # points, approximate minimum
 # Height (points) below the axes with and without tick labels and axis label
-LABELLED_HEIGHT, UNLABELLED_HEIGHT = 24.5, 3.0
+LABELLED_BOTTOM_MARGIN, UNLABELLED_BOTTOM_MARGIN = 24.5, 3.0
 # Printed characters for which str.isprintable is False
 PRINTED_SPECIAL_CHARACTERS = "\n\N{NO-BREAK SPACE}"
 # PDF/A limits strings to 32,767 characters, so very long words are split
@@ -62,7 +62,7 @@ class Page:
     def write_heading(self, text: str) -> None:
         self.add("heading", **styled_text(text, bold=True))
 
-    def write_small_text(self, text: str) -> None:
+    def write_muted_text(self, text: str) -> None:
         self.write(text, colour=MUTED_COLOUR)
 
     def write_labelled(
@@ -198,7 +198,7 @@ def _place_axes(block: Mapping[str, Any]) -> tuple[float, float, float, float]:
     axes, width, height = block["axes"], block["width"], block["height"]
     left_margin, right_margin = block["margins"]
     top_margin = 14.0 if axes.get_legend() else 4.0
-    bottom_margin = LABELLED_HEIGHT if axes.get_xlabel() else UNLABELLED_HEIGHT
+    bottom_margin = LABELLED_BOTTOM_MARGIN if axes.get_xlabel() else UNLABELLED_BOTTOM_MARGIN
     total_height = top_margin + height + bottom_margin
     block["figure"].set_size_inches(width / 72.0, total_height / 72.0)
     axes_width = width - left_margin - right_margin

@@ -34,7 +34,7 @@ NARROW_AXES_HEIGHT = 72.0  # points
 # Limit of the innovation axis ÷ largest innovation that the axis must show
 INNOVATION_AXIS_MARGIN_FACTOR = 1.3
 # The axis shows innovations up to this multiple of the median √S
-MAX_AXIS_LIMIT_IN_SQRT_S = 5.0
+MAX_AXIS_LIMIT_IN_INNOVATION_SIGMAS = 5.0
 # The bands differ in shade and hatching, because reports may be printed in greyscale
 _BAND_STYLE: dict[str, Any] = {"edgecolor": "none", "lw": 0.0}
 ON_GROUND_BAND_STYLE = _BAND_STYLE | {"facecolor": "#e4e4e4"}
@@ -272,11 +272,13 @@ def _describe_errors(result: AxisComparison, quantity: QuantityColumns) -> str:
 def _find_innovation_limit_m(result: AxisComparison) -> float:
     limits_m = []
     for innovations in _collect_innovation_tables(result).values():
-        median_sqrt_s_m = np.sqrt(innovations["innovation_variance_m2"].median())
+        median_innovation_sigma_m = np.sqrt(innovations["innovation_variance_m2"].median())
         # a quantile, because outliers would enlarge the axis
         quantile_m = np.quantile(innovations["innovation_m"].abs(), 0.99)
-        highest_limit_m = MAX_AXIS_LIMIT_IN_SQRT_S * median_sqrt_s_m
-        limits_m.append(float(np.clip(quantile_m, 2.0 * median_sqrt_s_m, highest_limit_m)))
+        highest_limit_m = MAX_AXIS_LIMIT_IN_INNOVATION_SIGMAS * median_innovation_sigma_m
+        limits_m.append(
+            float(np.clip(quantile_m, 2.0 * median_innovation_sigma_m, highest_limit_m))
+        )
     return INNOVATION_AXIS_MARGIN_FACTOR * max(limits_m)
 
 

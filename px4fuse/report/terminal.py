@@ -51,7 +51,7 @@ def make_comparison_page(
         return page
     if isinstance(analysis, AidingSourceAnalysis):
         write_aids(page, analysis.aids)
-        page.write_small_text(VERDICT_LEGEND)
+        page.write_muted_text(VERDICT_LEGEND)
         page.write_heading("Findings")
         write_findings(page, results.findings)
         page.write("" if results.findings else "None.")
@@ -73,7 +73,7 @@ def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
     )
     write_error_table(page, analysis)
     for note in (ERROR_LEGEND, *list_verdict_warnings(analysis)):
-        page.write_small_text(note)
+        page.write_muted_text(note)
     explanation = analysis.difference_steps.get(analysis.main.axis.name)
     if isinstance(explanation, DifferenceExplanation):
         page.write_labelled("KF-EKF2", explanation.sentences[0])

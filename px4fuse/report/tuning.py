@@ -37,9 +37,11 @@ def make_tuning_page(
         if isinstance(tuning, Unavailable):
             sentences.append(f"{name}: {tuning.reason}. {tuning.remedy}")
             continue
-        held_out_gain_text = correlation_text = ""
+        held_out_likelihood_gain_text = correlation_text = ""
         if not isinstance(tuning.held_out, Unavailable):
-            held_out_gain_text = f"{tuning.held_out.log_likelihood_gain_per_measurement:+.3f}"
+            held_out_likelihood_gain_text = (
+                f"{tuning.held_out.log_likelihood_gain_per_measurement:+.3f}"
+            )
         if not isinstance(tuning.before, Unavailable) and not isinstance(tuning.after, Unavailable):
             before, after = tuning.before.lag1_autocorrelation, tuning.after.lag1_autocorrelation
             correlation_text = f"{before:+.2f} → {after:+.2f}"
@@ -49,7 +51,7 @@ def make_tuning_page(
                 format_noise_estimate(tuning.sigma_a_two_state),
                 format_noise_estimate(tuning.sigma_z),
                 f"{tuning.log_likelihood_gain_per_measurement:.3f}",
-                held_out_gain_text,
+                held_out_likelihood_gain_text,
                 correlation_text,
             ]
         )
@@ -58,7 +60,7 @@ def make_tuning_page(
         page.add_table(TUNING_HEAD, rows, right_aligned_columns=(1, 2, 3, 4, 5))
         sentences.append(TUNING_NOTE)
     for text in sentences:
-        page.write_small_text(text)
+        page.write_muted_text(text)
     page.write_labelled_texts(dict(list_tuning_advice(comparison, tunings)))
     return page
 

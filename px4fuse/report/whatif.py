@@ -37,7 +37,7 @@ def make_column_headings(analysis: WhatIfAnalysis) -> list[str]:
 
 def make_statistic_rows(analysis: WhatIfAnalysis) -> list[list[str]]:
     """Return the statistics of EKF2 as logged, replayed, and replayed with other parameters."""
-    result = analysis.whatif
+    result = analysis.statistics
     texts_by_label = _format_statistics(result.replayed, result.replayed)
     columns = [
         _format_statistics(summary, result.replayed)
@@ -118,7 +118,7 @@ def make_sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str
 
 
 def select_sweep_summaries(analysis: WhatIfAnalysis) -> tuple[Ekf2Statistics, ...]:
-    return analysis.whatif.whatif[analysis.sweep_start_index :]
+    return analysis.statistics.whatif[analysis.sweep_start_index :]
 
 
 def find_swept_parameter(analysis: WhatIfAnalysis) -> str:
@@ -149,14 +149,14 @@ def describe_sweep(analysis: WhatIfAnalysis) -> list[str]:
                 "The horizontal position RMSE against ground truth is smallest at "
                 f"{parameter_name} {format_number(value)} ({rmse_m:.3f} m)."
             )
-    if not all(summary.is_predictable for summary in analysis.whatif.whatif):
+    if not all(summary.is_predictable for summary in analysis.statistics.whatif):
         sentences.append(
             "'not predictable': the replay rejects more than "
             f"{MAX_REJECTED_FRACTION:.0%} of the samples, {1000.0 * ADDED_POSITION_SIGMA_M:.0f} mm "
             "of added position noise changes the results strongly, or the replay fuses no height "
             f"for {HEIGHT_TIMEOUT_S:g} s."
         )
-    return [*sentences, *(f"{note}." for note in analysis.whatif.notes)]
+    return [*sentences, *(f"{note}." for note in analysis.statistics.notes)]
 
 
 def _format_number(value: float | Unavailable, digits: int = 3) -> str:
@@ -165,7 +165,7 @@ def _format_number(value: float | Unavailable, digits: int = 3) -> str:
 
 def make_whatif_page(analysis: WhatIfAnalysis) -> Page:
     page = Page()
-    log, whatif_result = analysis.flight.log, analysis.whatif
+    log, whatif_result = analysis.flight.log, analysis.statistics
     page.write_labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
     spans_text = ", ".join(
         f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.evaluated_s

@@ -195,7 +195,7 @@ class Answers(Record, kw_only=True):
     choices: Annotated[tuple[ChoiceLetter, ...], Meta(max_length=MAX_CHOICES)] = ()
 
     @property
-    def states_no_fault(self) -> bool:
+    def declares_no_fault(self) -> bool:
         return [mistake.kind for mistake in self.mistakes] == [NO_FAULT_KIND]
 
 

@@ -132,7 +132,7 @@ def make_sync_results(
 
 
 def make_whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> contract.WhatIfResults:
-    summaries, sweep_start_index = analysis.whatif, analysis.sweep_start_index
+    summaries, sweep_start_index = analysis.statistics, analysis.sweep_start_index
     return make_results(
         contract.WhatIfResults,
         command_line(request),

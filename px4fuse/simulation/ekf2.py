@@ -98,7 +98,7 @@ INDOOR_HEADING_SIGMA_RAD = 0.03
 INDOOR_HEIGHT_SIGMA_M = 0.15
 # Maximum interval (s) at which the simulated EKF2 fuses height and heading in a gap of the position
 # source. The variances in estimator_states are those after these fusions
-MAX_FUSION_INTERVAL_IN_GAP_S = 0.1
+MAX_HEIGHT_FUSION_INTERVAL_IN_POSITION_GAP_S = 0.1
 
 
 def _select_fused_aids(scenario: Scenario) -> tuple[Aid, ...]:
@@ -194,7 +194,7 @@ def simulate_ekf2(
         # (ev_pos_control.cpp). A start interval of 0 has this effect
         rules=rules
         if int(log_parameters[aid.switch]) & 1
-        else replace(rules, start_interval_s=0.0),
+        else replace(rules, max_sample_interval_to_start_s=0.0),
         mean_step_s=step_s,
         horizon_s=(int(np.ceil(settings["EKF2_DELAY_MAX"] * 1e3 / PREDICTION_STEP_US)) - 1)
         * step_s,
@@ -202,7 +202,7 @@ def simulate_ekf2(
         fuses_vision_height=False,
         imu_offset_m=np.zeros(3),
         aid=aid,
-        max_fusion_interval_in_gap_s=MAX_FUSION_INTERVAL_IN_GAP_S,
+        max_height_fusion_interval_in_position_gap_s=MAX_HEIGHT_FUSION_INTERVAL_IN_POSITION_GAP_S,
     )
     model_run = run_configurations(inputs, [FilterConfiguration(settings)])[0]
     return make_ekf2_topics(

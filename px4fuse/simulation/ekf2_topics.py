@@ -341,11 +341,11 @@ def _make_flags_topic(
 ) -> Topic:
     """Return estimator_status_flags: a message each second, and at each start or end of fusion."""
     events, time_s = model_run.events[0], model_run.segment.time_s
-    attempt_steps = events.end_step[
+    steps_with_fusion_attempt = events.end_step[
         model_run.fused[:, 0] | model_run.rejected[:, 0] | model_run.reset[:, 0]
     ]
     last_attempt_s = np.full(len(time_s), -np.inf)
-    last_attempt_s[attempt_steps] = time_s[attempt_steps]
+    last_attempt_s[steps_with_fusion_attempt] = time_s[steps_with_fusion_attempt]
     time_since_attempt_s = time_s - np.maximum.accumulate(last_attempt_s)
     is_fusing = time_since_attempt_s < model_inputs.rules.stop_timeout_s
     has_changed = np.diff(is_fusing.astype(int), prepend=0) != 0

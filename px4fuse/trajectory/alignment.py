@@ -20,10 +20,10 @@ MIN_EXTENT_RATIO_FOR_ROTATION = 1e-6
 # Minimum extent (m, RMS) of a path
 MIN_EXTENT_M = 1e-6
 # Maximum residual (RMS) after a yaw alignment, divided by the horizontal motion (RMS)
-MAX_RESIDUAL_RATIO_FOR_YAW = 1.0
+MAX_RESIDUAL_TO_MOTION_RATIO_FOR_YAW = 1.0
 # Maximum residual (RMS) after a rotation alignment, divided by the motion (RMS) perpendicular to
 # the main direction
-MAX_RESIDUAL_RATIO_FOR_ROTATION = 2.0
+MAX_RESIDUAL_TO_MOTION_RATIO_FOR_3D_ROTATION = 2.0
 
 
 class Transform(Record):
@@ -161,7 +161,7 @@ def _require_sufficient_motion(
         )
         residuals_m = residuals_m[:, :2]
         max_extent_m = float(np.linalg.norm(reference_extents_m))
-        max_residual_ratio = MAX_RESIDUAL_RATIO_FOR_YAW
+        max_residual_ratio = MAX_RESIDUAL_TO_MOTION_RATIO_FOR_YAW
         motion_text = "horizontal motion"
         remedy = "Set `alignment` to none to compare the trajectories without alignment."
     else:
@@ -169,7 +169,7 @@ def _require_sufficient_motion(
         max_extent_m, extent_m, _ = np.minimum(
             transform.scale * _compute_principal_extents_m(estimate_m), reference_extents_m
         )
-        max_residual_ratio = MAX_RESIDUAL_RATIO_FOR_ROTATION
+        max_residual_ratio = MAX_RESIDUAL_TO_MOTION_RATIO_FOR_3D_ROTATION
         motion_text = "motion perpendicular to the main direction of flight"
         remedy = "Set `alignment` to yaw or none."
     residual_m = compute_rms_length_m(residuals_m)

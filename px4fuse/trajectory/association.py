@@ -85,9 +85,9 @@ def associate(
             method, max_gap_s = "nearest", estimate_interval_s
     time_s = estimate.time_s + time_offset_s
     reference_start_s, reference_end_s = reference.time_s[[0, -1]]
-    max_time_outside_reference_s = 0.0
+    max_time_before_or_after_reference_s = 0.0
     if method == "nearest":
-        max_gap_s = max_time_outside_reference_s = (
+        max_gap_s = max_time_before_or_after_reference_s = (
             MAX_PAIR_TIME_DIFFERENCE_S if max_gap_s is None else max_gap_s
         )
         pose_indices, reference_indices = _pair_nearest(
@@ -106,8 +106,8 @@ def associate(
             "Check that both trajectories are of the same flight. If the clocks differ, "
             "set `time_offset_s` to auto.",
         )
-    is_outside = (time_s < reference_start_s - max_time_outside_reference_s) | (
-        time_s > reference_end_s + max_time_outside_reference_s
+    is_outside = (time_s < reference_start_s - max_time_before_or_after_reference_s) | (
+        time_s > reference_end_s + max_time_before_or_after_reference_s
     )
     pose_count_outside_reference = int(is_outside.sum())
     intervals_s = np.diff(time_s[pose_indices])

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from px4fuse.core.arrays import Array, BoolArray
-from px4fuse.core.record import NOT_WRITTEN, NotWritten, OrUnavailable, Record
+from px4fuse.core.record import NOT_IN_JSON, NotInJson, OrUnavailable, Record
 from px4fuse.core.text import capitalise_first, format_metres
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
@@ -45,7 +45,7 @@ from px4fuse.trajectory.time_offset import TimeOffset, compute_clock_offset_s, e
 # Maximum rotation (rad) of a constant orientation, above 0 because files contain rounded numbers
 MAX_ROTATION_OF_CONSTANT_ORIENTATION_RAD = 1e-6
 # Minimum number of poses and minimum extent (m) for the search for a constant orientation
-MIN_POSE_COUNT_FOR_PLACEHOLDER, MIN_EXTENT_FOR_PLACEHOLDER_M = 10, 1.0
+MIN_POSE_COUNT_TO_TEST_CONSTANT_ORIENTATION, MIN_EXTENT_TO_TEST_CONSTANT_ORIENTATION_M = 10, 1.0
 # Minimum duration (s) of a repeated position, and minimum motion (m) of the reference meanwhile
 MIN_FREEZE_DURATION_S, MIN_REFERENCE_MOTION_DURING_FREEZE_M = 2.0, 0.5
 # Minimum jump (m) relative to the reference, and its minimum ratio to the median step error
@@ -64,8 +64,8 @@ def drop_constant_orientation(trajectory: Trajectory) -> tuple[Trajectory, tuple
     rotation, extent_m = trajectory.rotation, np.ptp(trajectory.position_m, axis=0).max()
     if (
         rotation is None
-        or len(trajectory) < MIN_POSE_COUNT_FOR_PLACEHOLDER
-        or extent_m < MIN_EXTENT_FOR_PLACEHOLDER_M
+        or len(trajectory) < MIN_POSE_COUNT_TO_TEST_CONSTANT_ORIENTATION
+        or extent_m < MIN_EXTENT_TO_TEST_CONSTANT_ORIENTATION_M
         or (rotation[0].inv() * rotation).magnitude().max()
         > MAX_ROTATION_OF_CONSTANT_ORIENTATION_RAD
     ):
@@ -204,14 +204,14 @@ class Evaluation(Record, kw_only=True):
     rpe: tuple[RelativeError, ...]
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
-    estimate_track: NotWritten[Trajectory] = NOT_WRITTEN
-    reference_track: NotWritten[Trajectory] = NOT_WRITTEN
-    time_s: NotWritten[Array] = NOT_WRITTEN
-    distance_m: NotWritten[Array] = NOT_WRITTEN
-    unaligned_position_m: NotWritten[Array] = NOT_WRITTEN
-    aligned_position_m: NotWritten[Array] = NOT_WRITTEN
-    reference_position_m: NotWritten[Array] = NOT_WRITTEN
-    position_error_m: NotWritten[Array] = NOT_WRITTEN
+    estimate_track: NotInJson[Trajectory] = NOT_IN_JSON
+    reference_track: NotInJson[Trajectory] = NOT_IN_JSON
+    time_s: NotInJson[Array] = NOT_IN_JSON
+    distance_m: NotInJson[Array] = NOT_IN_JSON
+    unaligned_position_m: NotInJson[Array] = NOT_IN_JSON
+    aligned_position_m: NotInJson[Array] = NOT_IN_JSON
+    reference_position_m: NotInJson[Array] = NOT_IN_JSON
+    position_error_m: NotInJson[Array] = NOT_IN_JSON
 
 
 def evaluate(

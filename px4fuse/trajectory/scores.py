@@ -197,8 +197,8 @@ def find_pose_pairs(
     end_indices = np.searchsorted(distance_or_time, candidates[start_indices, best_columns])
     end_indices = np.maximum(end_indices, start_indices + 1)
     min_error = pair_distance_error[start_indices, best_columns]
-    is_near = min_error <= MAX_RELATIVE_PAIR_DISTANCE_ERROR * delta.value
-    return start_indices[is_near], end_indices[is_near]
+    is_distance_near_delta = min_error <= MAX_RELATIVE_PAIR_DISTANCE_ERROR * delta.value
+    return start_indices[is_distance_near_delta], end_indices[is_distance_near_delta]
 
 
 def _find_consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:

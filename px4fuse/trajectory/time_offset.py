@@ -226,17 +226,19 @@ def _find_candidate_offsets_s(sparse_track: Trajectory, dense_track: Trajectory)
     shorter_duration_s = min(float(np.ptp(track.time_s)) for track in (sparse_track, dense_track))
     if shorter_duration_s < 10 * step_s:
         return []
-    sparse_speeds, is_sparse_known = _compute_speeds(sparse_track, step_s)
-    dense_speeds, is_dense_known = _compute_speeds(dense_track, step_s)
+    sparse_speeds, is_sparse_speed_known = _compute_speeds(sparse_track, step_s)
+    dense_speeds, is_dense_speed_known = _compute_speeds(dense_track, step_s)
     correlations = []
     # If a trajectory has no orientations, only the speeds are correlated, and no angular speeds
     for sparse_values, dense_values in zip(sparse_speeds, dense_speeds, strict=False):
-        moments = compute_moments(sparse_values, dense_values, is_sparse_known, is_dense_known)
+        moments = compute_moments(
+            sparse_values, dense_values, is_sparse_speed_known, is_dense_speed_known
+        )
         is_usable = moments.count >= MIN_OVERLAP_FRACTION * shorter_duration_s / step_s
         # At rest, the variance of the speed is a rounding error
         for values, is_known, square_sum in (
-            (sparse_values, is_sparse_known, moments.sum_of_squares_a),
-            (dense_values, is_dense_known, moments.sum_of_squares_b),
+            (sparse_values, is_sparse_speed_known, moments.sum_of_squares_a),
+            (dense_values, is_dense_speed_known, moments.sum_of_squares_b),
         ):
             mean_square = np.var(values[is_known]) * np.mean(is_known)
             is_usable &= square_sum > 1e-3 * mean_square * moments.count
@@ -252,8 +254,8 @@ def _find_candidate_offsets_s(sparse_track: Trajectory, dense_track: Trajectory)
     )
     peak_indices = peak_indices[np.argsort(-correlation[peak_indices])][:MAX_CANDIDATE_OFFSETS]
     # Correlation index k is a shift by k - (n - 1) samples, for n sparse samples
-    dense_start_indices = peak_indices - (len(is_sparse_known) - 1)
-    lags_s = dense_start_indices * step_s + dense_track.time_s[0] - sparse_track.time_s[0]
+    sparse_start_indices = peak_indices - (len(is_sparse_speed_known) - 1)
+    lags_s = sparse_start_indices * step_s + dense_track.time_s[0] - sparse_track.time_s[0]
     return list(lags_s.tolist())
 
 
@@ -308,14 +310,15 @@ def _compute_interval_half_width_s(
         velocities
         - similarity_jacobian @ np.linalg.lstsq(similarity_jacobian, velocities, rcond=None)[0]
     )
-    (dense_square_sum, cross_product_sum), (_, sparse_square_sum) = (
+    (dense_track_square_sum, cross_product_sum), (_, sparse_track_square_sum) = (
         residual_velocities.T @ residual_velocities
     ).tolist()
     if (
-        dense_square_sum
+        dense_track_square_sum
         <= MIN_RESIDUAL_VELOCITY_FRACTION**2 * float((dense_track_velocity_m_s**2).sum())
         or cross_product_sum
-        <= MIN_RESIDUAL_VELOCITY_CORRELATION * (dense_square_sum * sparse_square_sum) ** 0.5
+        <= MIN_RESIDUAL_VELOCITY_CORRELATION
+        * (dense_track_square_sum * sparse_track_square_sum) ** 0.5
     ):
         return float("inf")
     likelihood_score = (
@@ -331,7 +334,7 @@ def _compute_interval_half_width_s(
     variance_if_uncorrelated, *lagged_products = autocovariance(likelihood_score)[: lag_count + 1]
     score_variance = variance_if_uncorrelated + max(2.0 * (lag_weights @ lagged_products), 0.0)
     student_t_quantile = float(stdtrit(max(pose_count / lag_count - 1.0, 1.0), 0.975))
-    return float(student_t_quantile * np.sqrt(score_variance) / dense_square_sum)
+    return float(student_t_quantile * np.sqrt(score_variance) / dense_track_square_sum)
 
 
 def _compute_correlation_length(values: Array) -> int:

@@ -47,7 +47,7 @@ PDF_NUMBER_TOLERANCE = 1e-5
 MAX_KERNING_PER_MILLE_EM = 200.0
 # Maximum size of a page's content in the submitted PDF ÷ in the redrawn PDF (generated again by
 # px4fuse). Escape sequences need four bytes per character
-MAX_CONTENT_SIZE_RATIO = 4
+MAX_SIZE_RATIO_TO_REDRAWN_PAGE = 4
 # Maximum time (s) for comparing two PDFs; the comparison of the largest report takes 3 s
 PDF_COMPARISON_TIMEOUT_S = 12.0
 # Maximum memory (bytes) for comparing two PDFs; the largest report needs 0.3 GB
@@ -284,7 +284,9 @@ class _PdfComparison:
         ):
             return
         is_page_content = key == "/Contents" or stream_type == "/Pattern"
-        if not is_page_content or len(submitted_data) > MAX_CONTENT_SIZE_RATIO * len(redrawn_data):
+        if not is_page_content or len(submitted_data) > MAX_SIZE_RATIO_TO_REDRAWN_PAGE * len(
+            redrawn_data
+        ):
             yield f"the content of the PDF entry {key} was changed", False
         elif description := self._describe_operation_difference(submitted_data, redrawn_data):
             yield description, False
@@ -421,7 +423,7 @@ def _has_near_operands(
     """Return True if the operands of a PDF drawing operator are equal within the tolerances."""
     if len(submitted_operands) != len(redrawn_operands):
         return False
-    first_coordinate_index = _FIRST_COORDINATE_INDEX.get(operator, len(redrawn_operands))
+    first_coordinate_operand_index = _FIRST_COORDINATE_INDEX.get(operator, len(redrawn_operands))
     for index, (submitted_operand, redrawn_operand) in enumerate(
         zip(submitted_operands, redrawn_operands, strict=True)
     ):
@@ -429,7 +431,7 @@ def _has_near_operands(
             continue
         if not isinstance(submitted_operand, float) or not isinstance(redrawn_operand, float):
             return False
-        is_coordinate = index >= first_coordinate_index
+        is_coordinate = index >= first_coordinate_operand_index
         tolerance = COORDINATE_TOLERANCE_PT if is_coordinate else PDF_NUMBER_TOLERANCE
         if not math.isclose(
             submitted_operand, redrawn_operand, rel_tol=PDF_NUMBER_TOLERANCE, abs_tol=tolerance

@@ -188,12 +188,12 @@ def _walk_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObje
     missing_count = value_count = 0
     remaining_values: list[tuple[Any, bool]] = [(reader.trailer, False)]
     while remaining_values:
-        value, is_action_after_click = remaining_values.pop()
+        value, runs_only_after_click = remaining_values.pop()
         value_count += 1
         if isinstance(value, IndirectObject):
-            if (value, is_action_after_click) in visited_references:
+            if (value, runs_only_after_click) in visited_references:
                 continue
-            visited_references.add((value, is_action_after_click))
+            visited_references.add((value, runs_only_after_click))
             # pypdf searches the whole file for each object that the cross-reference table omits
             number, generation = value.idnum, value.generation
             is_in_object_stream = generation == 0 and number in reader.xref_objStm
@@ -209,21 +209,21 @@ def _walk_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObje
         if value_count > MAX_PDF_VALUES:
             raise ResultsError(_TOO_COSTLY_REASON)
         if isinstance(value, DictionaryObject):
-            yield value, is_action_after_click
+            yield value, runs_only_after_click
             remaining_values.extend((value.raw_get(key), key == "/A") for key in value)
         elif isinstance(value, ArrayObject):
             remaining_values.extend((element, False) for element in list.__iter__(value))
 
 
 def _find_unexpected_features(
-    dictionary: DictionaryObject, is_action_after_click: bool
+    dictionary: DictionaryObject, runs_only_after_click: bool
 ) -> Iterator[str]:
     """Yield names of features that px4fuse never writes, for example scripts or external files."""
     yield from (key[1:] for key in dictionary if _ACTIVE_CONTENT_KEY_PATTERN.fullmatch(key))
     action, dictionary_type = (_read_pdf_name(dictionary.get(key)) or "" for key in ("/S", "/Type"))
     if _DANGEROUS_ACTION_PATTERN.fullmatch(action):
         yield action[1:]
-    if action == "/URI" and not is_action_after_click:
+    if action == "/URI" and not runs_only_after_click:
         yield "an action that opens a URL without a click"
     is_stream = isinstance(dictionary, StreamObject)
     if ("/EF" not in dictionary and dictionary_type in {"/Filespec", "/F"}) or (
@@ -254,8 +254,8 @@ def _read_attachment(reader: pypdf.PdfReader) -> bytes:
     file_specifications: list[DictionaryObject] = []
     streams: dict[int, Any] = {}
     unexpected_features: set[str] = set()
-    for dictionary, is_action_after_click in _walk_dictionaries(reader):
-        unexpected_features.update(_find_unexpected_features(dictionary, is_action_after_click))
+    for dictionary, runs_only_after_click in _walk_dictionaries(reader):
+        unexpected_features.update(_find_unexpected_features(dictionary, runs_only_after_click))
         if _read_pdf_name(dictionary.get("/Type")) == "/EmbeddedFile":
             streams[id(dictionary)] = dictionary
         if "/EF" in dictionary:

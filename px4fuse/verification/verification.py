@@ -74,7 +74,7 @@ MAX_LISTED_DIFFERENCES = 20
 MAX_LISTED_PAGE_DIFFERENCES = 5
 MAX_TEXT_LENGTH = 120
 # Factors by which a result is multiplied before it is printed (per cent; mm or ms)
-PRINTED_UNIT_FACTORS = (1.0, 100.0, 1000.0)
+RESULT_TO_PRINTED_UNIT_FACTORS = (1.0, 100.0, 1000.0)
 # Maximum number of lines of a student's notes in a report; a page has 60 lines
 MAX_NOTES_LINES = 5_000
 _NUMBER_PATTERN = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
@@ -340,7 +340,7 @@ def is_same_number_up_to_rounding(
     printed_pair = float(submitted_number), float(redrawn_number)
     return decimals == _count_decimals(redrawn_number) and any(
         printed_pair == (round(abs(a) * scale, decimals), round(abs(b) * scale, decimals))
-        for scale in PRINTED_UNIT_FACTORS
+        for scale in RESULT_TO_PRINTED_UNIT_FACTORS
         for a, b in agreeing_pairs
     )
 

@@ -45,7 +45,7 @@ from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.loop.model import Loop
-from px4fuse.readers.ulog_topics import ignores_assignment_flag
+from px4fuse.readers.ulog_topics import shows_diagnosis_of_assignments
 from px4fuse.request import ComparisonRequest, Landing, LoopRequest
 from px4fuse.results.answer_form import Answers, select_questions
 from px4fuse.simulation.sensors import TIMESYNC_CONVERGENCE_TIME_S
@@ -143,9 +143,9 @@ def forms_of(number: int) -> tuple[CorrectFormAnswers, dict[str, Answers]]:
         loop = None
         if answer.scenario["kind"] == "loop":
             loop = analyse_loop_closure(LoopRequest(source=str(log), landed_at=Landing(0.0, 0.0)))
-        token = ignores_assignment_flag.set(True)
+        token = shows_diagnosis_of_assignments.set(True)
         full = diagnose(ComparisonRequest(log=str(log)))
-        ignores_assignment_flag.reset(token)
+        shows_diagnosis_of_assignments.reset(token)
     named = [
         KIND_BY_FINDING[finding.id]
         for finding in full.findings

@@ -65,7 +65,7 @@ def describe_agreement(flown: FlownFlight) -> str:
         if getattr(agreement, aid)
     }
     text = ", ".join(f"{aid} {correlation:.4f}" for aid, correlation in correlations.items())
-    height = flown.model.inputs.reason_for_logged_height
+    height = flown.model.inputs.reason_to_use_logged_height
     return (
         f"{text}; rejected {agreement.rejected_fraction_logged:.1%}, published position "
         f"{agreement.published_rms_difference_m:.3f} m, good {flown.model.agreement.good}"

@@ -171,7 +171,7 @@ def laid_over(
 ) -> Flight:  # fmt: skip
     """Return the flight with simulated position errors, and without EKF2."""
     rng = np.random.default_rng(seed)
-    first = next(track for track in flight.positions if track.origin.is_auto_candidate)
+    first = next(track for track in flight.positions if track.origin.is_selectable_by_default)
     start, end = max(known.x[0], 0.0), known.x[-1]
     count = int((end - start) * rate_hz)
     # time slots of a tag, with jitter

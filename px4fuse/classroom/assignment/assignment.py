@@ -138,7 +138,7 @@ def write_assignment(
     # an answer key without these students belongs to another class
     is_known_student = [normalise_text(student.student_id) in answers for student in students]
     is_key_of_this_class = not answers or any(is_known_student)
-    _require_key_of_same_flights(key_file, key.kind == kind and is_key_of_this_class)
+    _require_answer_key_of_same_flights(key_file, key.kind == kind and is_key_of_this_class)
     stored_secret = key.secret
     if secret is None:
         stored_secret = stored_secret or secrets.token_urlsafe(24)
@@ -151,7 +151,7 @@ def write_assignment(
             secret, student, kind, fault_count, with_ground_truth
         )
         stored_answer = answers.setdefault(normalise_text(student.student_id), answer)
-        _require_key_of_same_flights(key_file, stored_answer.sha256 == answer.sha256)
+        _require_answer_key_of_same_flights(key_file, stored_answer.sha256 == answer.sha256)
         choices = stored_answer.form.choices if stored_answer.form else ()
         empty_form = format_answer_form(
             student.log_file_name, answer.sha256, [choice for choice, _ in choices]
@@ -199,7 +199,7 @@ def _exists_with_same_content(path: Path, content: bytes) -> bool:
     )
 
 
-def _require_key_of_same_flights(key_file: Path, has_same_flights: bool) -> None:
+def _require_answer_key_of_same_flights(key_file: Path, has_same_flights: bool) -> None:
     if not has_same_flights:
         raise OutputError(
             f"{key_file} is the answer key of other flights and was not overwritten. Choose "

@@ -103,15 +103,15 @@ def draw_figures(draw_number: Callable[[str], float]) -> bytes:
     comparisons = {}
     for title, kind in _select_fault_kinds(draw_number).items():
 
-        def draw_figure_number(number_name: str, title: str = title) -> float:
+        def draw_random_number_for_figure(number_name: str, title: str = title) -> float:
             return draw_number(f"{title} {number_name}")
 
-        scenario_numbers = draw_scenario_numbers("aisle", draw_figure_number)
+        random_scenario_parameters = draw_scenario_numbers("aisle", draw_random_number_for_figure)
         scenario = make_scenario(
             "aisle",
             passes=STRAIGHT_PASS_COUNT,
-            seed=int(2**53 * draw_figure_number("seed")),
-            **scenario_numbers,
+            seed=int(2**53 * draw_random_number_for_figure("seed")),
+            **random_scenario_parameters,
         )
         comparisons[title] = compare_simulation(
             flights.simulate(

@@ -228,8 +228,8 @@ def compute_form_answers(simulation: flights.Simulation, log_sha256: str) -> Cor
     return CorrectFormAnswers(
         faults,
         sigma_z_m,
-        _make_correct_verdict(comparison, "kf"),
-        _make_correct_verdict(comparison, "ekf2"),
+        _determine_right_verdict(comparison, "kf"),
+        _determine_right_verdict(comparison, "ekf2"),
         *_find_ekf2_behaviours(comparison, faults, sigma_z_m),
         tuple(
             compute_numeric_answer(comparison.main, question)
@@ -284,7 +284,7 @@ def _make_injected_fault(
     return InjectedFault(name, size, low, high, fault_start_s, fault_end_s)
 
 
-def _make_correct_verdict(comparison: Comparison, filter_name: FilterName) -> CorrectVerdict:
+def _determine_right_verdict(comparison: Comparison, filter_name: FilterName) -> CorrectVerdict:
     filter_summary = comparison.main.filters[filter_name]
     if not isinstance(filter_summary, FilterSummary):
         return CorrectVerdict("")
@@ -315,10 +315,10 @@ def _find_ekf2_behaviours(
         has_bad_samples = not size_by_kind.keys().isdisjoint({"nlos", "jump"})
         required.append("rejected outliers" if has_bad_samples else "rejected good samples")
     ekf2 = comparison.flight.ekf2
-    resets_count_from_s = comparison.segment.start_s + INITIAL_TIME_WITHOUT_RESETS_S
+    earliest_counted_reset_time_s = comparison.segment.start_s + INITIAL_TIME_WITHOUT_RESETS_S
     if any(
         reset.quantity == "position"
-        and reset.time_s > resets_count_from_s
+        and reset.time_s > earliest_counted_reset_time_s
         and math.hypot(*reset.delta[:2]) > MIN_RESET_M
         for reset in (ekf2.resets if isinstance(ekf2, Ekf2) else ())
     ):

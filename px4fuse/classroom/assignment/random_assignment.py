@@ -39,7 +39,7 @@ LOOP_PROBABILITY = 1 / 3
 EASIEST_DIFFICULTY, HARDEST_DIFFICULTY = 0.6, 1.0
 # Probability that a flight has faults with a difficulty above 1, which px4fuse may not detect; and
 # the maximum difficulty of these faults
-HARD_FAULTS_PROBABILITY, MAX_FAULT_DIFFICULTY = 0.25, 1.5
+DIFFICULT_FAULTS_PROBABILITY, MAX_FAULT_DIFFICULTY = 0.25, 1.5
 
 
 class AssignableFault(Record):
@@ -187,7 +187,7 @@ def assign_random_flight(
             list(accumulate(PROBABILITY_BY_FAULT_COUNT[kind][:-1])), draw_number("count")
         )
     low, high = EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
-    if draw_number("undetectable") < HARD_FAULTS_PROBABILITY:
+    if draw_number("undetectable") < DIFFICULT_FAULTS_PROBABILITY:
         low, high = HARDEST_DIFFICULTY, MAX_FAULT_DIFFICULTY
     faults: list[AssignableFault] = []
     difficulties, mistake_options = [], []

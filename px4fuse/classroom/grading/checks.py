@@ -37,7 +37,7 @@ BOTH_AXES_ADVICE = "Make the report without --axis: the axes north and east are 
 Text = Annotated[str, Meta(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
 Title = Annotated[str, Meta(max_length=200, pattern=r"^(?=.*\S)[^\x00-\x1f\x7f]*$")]
 Bound = Annotated[float, Meta(ge=-1e12, le=1e12)]
-ErrorFactorAtZeroPoints = Annotated[float, Meta(ge=1.0, le=1000.0)]
+ErrorFactorAtZeroScore = Annotated[float, Meta(ge=1.0, le=1000.0)]
 # Fraction of the maximum points (0 to 1), and reason for the student
 ScoreAndReason = tuple[float, str]
 
@@ -73,19 +73,19 @@ class RubricItem(Record, kw_only=True, tag_field="check"):
         return has_required_key and {self.report, self.command} <= {"any", command_name}
 
 
-def compute_points_fraction(deviation_factor: float, factor_at_zero_points: float) -> float:
+def compute_points_fraction(deviation_factor: float, factor_at_zero_score: float) -> float:
     """Return the fraction of the maximum points for a value with a wrong factor.
 
-    The fraction is 1 - ln(deviation_factor) / ln(factor_at_zero_points), between 0 and 1.
+    The fraction is 1 - ln(deviation_factor) / ln(factor_at_zero_score), between 0 and 1.
 
     >>> [round(compute_points_fraction(deviation, 4.0), 2) for deviation in (1.0, 2.0, 4.0, 9.0)]
     [1.0, 0.5, 0.0, 0.0]
     """
     if deviation_factor <= 1.0:
         return 1.0
-    if deviation_factor >= factor_at_zero_points:
+    if deviation_factor >= factor_at_zero_score:
         return 0.0
-    return 1.0 - math.log(deviation_factor) / math.log(factor_at_zero_points)
+    return 1.0 - math.log(deviation_factor) / math.log(factor_at_zero_score)
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class ScoringInput:
         return self.key.find_answers_by_log_sha256(log_sha256(self.results)) if self.key else None
 
     @cached_property
-    def assigned_log_answers(self) -> CorrectAnswers | None:
+    def right_answers_for_assigned_log(self) -> CorrectAnswers | None:
         """Right answers for the log that the instructor gave to the student."""
         if self.key is None:
             return None
@@ -127,7 +127,9 @@ class ScoringInput:
     @cached_property
     def is_own_log(self) -> bool:
         """True if the report is about the log that the instructor gave to the student."""
-        assigned_sha256 = self.assigned_log_answers and self.assigned_log_answers.sha256
+        assigned_sha256 = (
+            self.right_answers_for_assigned_log and self.right_answers_for_assigned_log.sha256
+        )
         return self.key is None or assigned_sha256 == log_sha256(self.results)
 
     @cached_property
@@ -151,9 +153,11 @@ class ScoringInput:
     @cached_property
     def form_points(self) -> FormPoints | str:
         """Points for the student's answers, or the reason for no points."""
-        assigned_log_answers = self.assigned_log_answers
-        if self.right_answers is None or (assigned_log_answers and not self.is_own_log):
-            file_text = format_reason(assigned_log_answers.file if assigned_log_answers else "")
+        right_answers_for_assigned_log = self.right_answers_for_assigned_log
+        if self.right_answers is None or (right_answers_for_assigned_log and not self.is_own_log):
+            file_text = format_reason(
+                right_answers_for_assigned_log.file if right_answers_for_assigned_log else ""
+            )
             return (
                 f"this report is not about the log that you were given{file_text}. Make a "
                 "report of that log, with your --id"
@@ -229,8 +233,8 @@ class NumberItem(RubricItem, tag="number"):
 
     def __post_init__(self) -> None:
         is_bounded = math.isfinite(self.at_least) or math.isfinite(self.at_most)
-        has_zero_points_inside = self.zero_at is not None and self._compute_excess(self.zero_at) < 0
-        if not is_bounded or self.at_least > self.at_most or has_zero_points_inside:
+        is_zero_at_in_bounds = self.zero_at is not None and self._compute_excess(self.zero_at) < 0
+        if not is_bounded or self.at_least > self.at_most or is_zero_at_in_bounds:
             raise ValueError(
                 "give at_least, at_most or both (at_least <= at_most); zero_at must be outside"
             )
@@ -243,8 +247,8 @@ class NumberItem(RubricItem, tag="number"):
         excess = self._compute_excess(number)
         if excess <= 0.0:
             return 1.0
-        excess_at_zero_points = 0.0 if self.zero_at is None else self._compute_excess(self.zero_at)
-        return 0.0 if excess >= excess_at_zero_points else 1.0 - excess / excess_at_zero_points
+        excess_at_zero_score = 0.0 if self.zero_at is None else self._compute_excess(self.zero_at)
+        return 0.0 if excess >= excess_at_zero_score else 1.0 - excess / excess_at_zero_score
 
     def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
         values = find_values(scoring_input.values, self.path)
@@ -306,16 +310,16 @@ NOISE_SETTINGS: dict[NoiseSettingName, tuple[str, str, str]] = {
 }
 
 
-class TuningItem(RubricItem, tag="tuning", rename={"factor_at_zero_points": "factor"}):
+class TuningItem(RubricItem, tag="tuning", rename={"factor_at_zero_score": "factor"}):
     """Check that SIGMA_A or SIGMA_Z is within the 95 % interval of its estimate.
 
-    Outside the interval, the points decrease to zero at a deviation of ``factor_at_zero_points``.
+    Outside the interval, the points decrease to zero at a deviation of ``factor_at_zero_score``.
     """
 
     command: ClassVar[str] = "compare"
 
     setting: NoiseSettingName
-    factor_at_zero_points: ErrorFactorAtZeroPoints = 2.0
+    factor_at_zero_score: ErrorFactorAtZeroScore = 2.0
 
     def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
         comparison = scoring_input.comparison
@@ -338,13 +342,13 @@ class TuningItem(RubricItem, tag="tuning", rename={"factor_at_zero_points": "fac
             lower_bound / chosen_value,
             1.0,
         )
-        position_text, advice = "within", ""
+        deviation_text, advice = "within", ""
         if deviation_factor > 1.0:
             side = "above" if chosen_value > upper_bound else "below"
-            position_text = f"a factor of {format_factor(deviation_factor)} {side}"
+            deviation_text = f"a factor of {format_factor(deviation_factor)} {side}"
             advice = f" Set {option} to a value in this interval."
-        return compute_points_fraction(deviation_factor, self.factor_at_zero_points), (
-            f"Your {label} {chosen_value:.3g} {unit} is {position_text} the 95 % interval of the "
+        return compute_points_fraction(deviation_factor, self.factor_at_zero_score), (
+            f"Your {label} {chosen_value:.3g} {unit} is {deviation_text} the 95 % interval of the "
             f"maximum-likelihood estimate ({lower_bound:.3g} to {upper_bound:.3g} {unit}).{advice}"
         )
 
@@ -360,15 +364,15 @@ def _find_max_position_error_m(comparison: ComparisonResults) -> float:
     return max(errors_m, default=0.0)
 
 
-class ConsistencyItem(RubricItem, tag="consistent", rename={"factor_at_zero_points": "factor"}):
+class ConsistencyItem(RubricItem, tag="consistent", rename={"factor_at_zero_score": "factor"}):
     """Check that KF is consistent, by the mean NIS of north and east together.
 
-    The points decrease to zero if the reported σ is wrong by ``factor_at_zero_points``.
+    The points decrease to zero if the reported σ is wrong by ``factor_at_zero_score``.
     """
 
     command: ClassVar[str] = "compare"
 
-    factor_at_zero_points: ErrorFactorAtZeroPoints = 2.0
+    factor_at_zero_score: ErrorFactorAtZeroScore = 2.0
 
     def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
         nis_result = scoring_input.comparison.horizontal.get("kf")
@@ -379,7 +383,7 @@ class ConsistencyItem(RubricItem, tag="consistent", rename={"factor_at_zero_poin
             return 1.0, "KF is consistent."
         direction = "small" if nis_result.nis_mean > 1.0 else "large"
         sigma_factor = nis_result.sigma_error_factor
-        points_fraction = compute_points_fraction(sigma_factor, self.factor_at_zero_points)
+        points_fraction = compute_points_fraction(sigma_factor, self.factor_at_zero_score)
         advice = (
             "Compare SIGMA_A and SIGMA_Z with the maximum-likelihood estimates, and look for "
             "errors that are not white noise."

@@ -130,7 +130,9 @@ def _make_grade_row(grade: Grade, item_titles: Sequence[str]) -> Row:
         *(frame.make_number_cell(points_by_title.get(title)) for title in item_titles),
     )
     # overrides.csv needs an id or a file name, which an anonymous student lacks
-    points_inputs = (_make_points_inputs(grade),) if grade.student_id or grade.file_name else ()
+    points_input_boxes = (
+        (_make_points_input_boxes(grade),) if grade.student_id or grade.file_name else ()
+    )
     links = (
         [("Report recomputed from the log (PDF)", make_relative_url(report.redrawn_report_path))]
         if report
@@ -139,7 +141,7 @@ def _make_grade_row(grade: Grade, item_titles: Sequence[str]) -> Row:
     return Row(
         cells,
         tuple(_make_grade_tags(grade)),
-        (*_make_grade_details(grade), *points_inputs),
+        (*_make_grade_details(grade), *points_input_boxes),
         (frame.make_links_section("Report", links),),
     )
 
@@ -203,7 +205,7 @@ def _make_points_cell(grade: Grade) -> Cell:
     )
 
 
-def _make_points_inputs(grade: Grade) -> RowDetailsSection:
+def _make_points_input_boxes(grade: Grade) -> RowDetailsSection:
     """Make the input boxes for the points that the instructor can enter."""
     report = grade.counted_report
     max_points_by_title = {

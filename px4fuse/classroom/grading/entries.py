@@ -74,10 +74,10 @@ class LateRule:
         >>> parse_late_rule("10%/day up to 30%").compute_deduction(1e9, 50.0)
         15.0
         """
-        late_unit_count = math.ceil(max(lateness_s, 0.0) / self.lateness_unit_s)
+        started_day_or_hour_count = math.ceil(max(lateness_s, 0.0) / self.lateness_unit_s)
         return round(
             max_points
-            * min(late_unit_count * self.deduction_per_unit, self.max_deduction_fraction),
+            * min(started_day_or_hour_count * self.deduction_per_unit, self.max_deduction_fraction),
             2,
         )
 
@@ -94,7 +94,7 @@ class Course:
         Class list; None for the students of the answer key or first worksheet.
     worksheets : tuple of Sheet
         Tables of learning platforms, into which the grades are entered.
-    column : str
+    grade_column_title : str
         Title of the grade column in the worksheets.
     attempt : {"latest", "best", "first"}
         Report that counts if a student submitted several.
@@ -118,7 +118,7 @@ class Course:
     title: str = ""
     roster: tuple[Person, ...] | None = None
     worksheets: tuple[Sheet, ...] = ()
-    column: str = ""
+    grade_column_title: str = ""
     attempt: Literal["latest", "best", "first"] = "latest"
     due: datetime | None = None
     grace_s: float = 0.0
@@ -276,9 +276,11 @@ def _make_candidate(
             "The student's file name imitates the upload name of a learning platform. "
             "Check who handed in the file."
         )
-    reported_index = class_list.find_student_index(Person(report.student_id)) if platform else None
-    if reported_index is not None and student_index not in (None, reported_index):
-        reported_person = class_list.people[reported_index]
+    reported_student_index = (
+        class_list.find_student_index(Person(report.student_id)) if platform else None
+    )
+    if reported_student_index is not None and student_index not in (None, reported_student_index):
+        reported_person = class_list.people[reported_student_index]
         flags.append(
             f"The id in the report is that of {reported_person.student_id} "
             f"({reported_person.name or 'no name'}), but {platform} names another student."
@@ -459,7 +461,7 @@ def match_overrides(
         if student_index is None:
             notes.append(f"{OVERRIDES_NAME}: no student has the id {student_text}.")
             continue
-        matched = matched_overrides[student_index]
+        matched_override_by_title = matched_overrides[student_index]
         max_points_by_title = {TOTAL_TITLE: max_total_points, "": math.inf}
         if report := grades[student_index].counted_report:
             max_points_by_title[TOTAL_TITLE] = report.max_points
@@ -469,13 +471,13 @@ def match_overrides(
             title = title_by_normalised_title.get(normalise_text(item_title))
             if title is None:
                 problem = f"student {student_text} has no item {one_line(item_title, 60)!r}"
-            elif title in matched:
+            elif title in matched_override_by_title:
                 problem = f"student {student_text} has two rows for {title or 'the whole report'!r}"
             elif (override.points or 0.0) > max_points_by_title[title]:
                 limit_text = f"{max_points_by_title[title]:g} points of {one_line(title, 60)!r}"
                 problem = f"points of student {student_text} are above the maximum, {limit_text}"
             else:
-                matched[title] = override
+                matched_override_by_title[title] = override
                 continue
             notes.append(f"{OVERRIDES_NAME}: {problem}.")
     return matched_overrides, notes

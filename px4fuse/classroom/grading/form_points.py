@@ -23,7 +23,7 @@ from px4fuse.results.answer_form import (
 )
 
 # Fraction of the points for questions about the flight; the rest is for questions about plots
-FLIGHT_QUESTIONS_POINTS_FRACTION = 0.2
+POINTS_FRACTION_OF_FLIGHT_QUESTIONS = 0.2
 # Points deducted for each false fault
 FALSE_FAULT_DEDUCTION = 10.0
 # With this number of false faults or more (guesses), right faults give no points either
@@ -46,11 +46,11 @@ FAULT_TIME_TOLERANCE_S = 2.0
 # Tolerance of the start and the end of a fault ÷ time since the first sample
 FAULT_TIME_TOLERANCE_FRACTION = 0.05
 # Maximum relative error of a number that the student computed, for full points
-MAX_NUMBER_ERROR_FULL_POINTS = 0.02
+MAX_RELATIVE_NUMBER_ERROR_FOR_FULL_POINTS = 0.02
 # Maximum relative error of a number that the student computed, for half of the points
-MAX_NUMBER_ERROR_HALF_POINTS = 0.10
+MAX_RELATIVE_NUMBER_ERROR_FOR_HALF_POINTS = 0.10
 # Maximum relative error of the stated size of an injected fault, for half of the points
-MAX_SIZE_ERROR_HALF_POINTS = 0.4
+MAX_RELATIVE_SIZE_ERROR_FOR_HALF_POINTS = 0.4
 
 
 class CorrectionRule(Record):
@@ -105,11 +105,11 @@ class FormPoints:
 
 def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> FormPoints:
     """Compare a student's answers with the right answers, and compute the points."""
-    is_recognised_as_fault_free = not right_answers.mistakes and answers.states_no_fault
+    is_recognised_as_fault_free = not right_answers.mistakes and answers.declares_no_fault
     weights = POINTS_CONFIG["weights_clean" if is_recognised_as_fault_free else "weights"]
     scores = dict.fromkeys(FORM_PART_NAMES, 0.0)
-    matches, false_faults = _match_faults(answers, right_answers)
-    if right_answers.mistakes and len(false_faults) < ZERO_POINTS_FALSE_FAULT_COUNT:
+    matches, wrongly_named_faults = _match_faults(answers, right_answers)
+    if right_answers.mistakes and len(wrongly_named_faults) < ZERO_POINTS_FALSE_FAULT_COUNT:
         scores |= _score_faults(matches, right_answers)
     scores["numbers"] = _score_numbers(answers, right_answers)
     scores["verdicts"] = _score_verdicts(answers, right_answers)
@@ -122,25 +122,27 @@ def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> 
     elif right_answers.mistakes and all(fault.size is None for fault in right_answers.mistakes):
         # no injected fault has a size: the points for sizes are given for the right fault names
         points["mistakes"] += weights["sizes"] * scores["mistakes"]
-    deduction = FALSE_FAULT_DEDUCTION * len(false_faults)
+    deduction = FALSE_FAULT_DEDUCTION * len(wrongly_named_faults)
     points["mistakes"] = max(points["mistakes"] - deduction, 0.0)
     if right_answers.choices:
         weights, points = (
-            {name: FLIGHT_QUESTIONS_POINTS_FRACTION * value for name, value in values.items()}
+            {name: POINTS_FRACTION_OF_FLIGHT_QUESTIONS * value for name, value in values.items()}
             for values in (weights, points)
         )
-        weights["figures"] = 100.0 * (1.0 - FLIGHT_QUESTIONS_POINTS_FRACTION)
+        weights["figures"] = 100.0 * (1.0 - POINTS_FRACTION_OF_FLIGHT_QUESTIONS)
         points["figures"] = weights["figures"] * _score_choices(answers, right_answers)
-    named_kinds = [named_fault.kind for named_fault in answers.mistakes]
+    kinds_named_by_student = [named_fault.kind for named_fault in answers.mistakes]
     feedback = (
-        *_describe_fault_answers(matches, false_faults, is_recognised_as_fault_free),
+        *_describe_fault_answers(matches, wrongly_named_faults, is_recognised_as_fault_free),
         *_describe_wrong_answers(answers, right_answers),
     )
     parts = tuple(
         ItemScore(name, points[name], max_points, "") for name, max_points in weights.items()
     )
     return FormPoints(
-        parts, feedback, {fault.kind: fault.kind in named_kinds for fault in right_answers.mistakes}
+        parts,
+        feedback,
+        {fault.kind: fault.kind in kinds_named_by_student for fault in right_answers.mistakes},
     )
 
 
@@ -149,11 +151,11 @@ FaultMatch = tuple[InjectedFault, NamedFault | None, float]
 
 
 def _describe_fault_answers(
-    matches: list[FaultMatch], false_faults: list[NamedFault], states_no_fault: bool
+    matches: list[FaultMatch], wrongly_named_faults: list[NamedFault], declares_no_fault: bool
 ) -> Iterator[str]:
     """Yield feedback on each injected fault, and on named faults that the flight does not have."""
     if not matches:
-        yield f"your flight has no injected fault{', as your form states' * states_no_fault}"
+        yield f"your flight has no injected fault{', as your form states' * declares_no_fault}"
     for fault, named_fault, _ in matches:
         fault_text = f"{fault.kind} ({FAULT_KINDS[fault.kind].description})"
         right_answer = describe_right_answer(fault)
@@ -163,8 +165,8 @@ def _describe_fault_answers(
             yield f"you named {named_fault.kind} instead of {fault_text}: {right_answer}"
         else:
             yield f"you named {fault.kind}, which is right ({right_answer})"
-    if false_faults:
-        kinds = ", ".join(named_fault.kind for named_fault in false_faults)
+    if wrongly_named_faults:
+        kinds = ", ".join(named_fault.kind for named_fault in wrongly_named_faults)
         yield f"you named faults that your flight does not have: {kinds}"
 
 
@@ -188,7 +190,7 @@ def _describe_wrong_answers(answers: Answers, right_answers: CorrectFormAnswers)
     ]
     if _score_ekf2_behaviour(answers, right_answers) < 1.0:
         rows.append(("behaviour of EKF2", answers.ekf2_did, right_answers.ekf2_did))
-    tolerance_text = f"within {100.0 * MAX_NUMBER_ERROR_FULL_POINTS:g} %"
+    tolerance_text = f"within {100.0 * MAX_RELATIVE_NUMBER_ERROR_FOR_FULL_POINTS:g} %"
     for question, given, right in zip_longest(
         select_questions(answers.log_sha256), answers.quantities, right_answers.quantities
     ):
@@ -217,23 +219,23 @@ def _match_faults(
 
     Return the matches, and the named faults that match no injected fault.
     """
-    false_faults = [
+    wrongly_named_faults = [
         named_fault for named_fault in answers.mistakes if named_fault.kind != NO_FAULT_KIND
     ]
     match_by_kind: dict[str, tuple[NamedFault, float]] = {}
     candidates = [
         (score_fault_kind(fault.kind, named_fault.kind), fault.kind, named_fault)
         for fault in right_answers.mistakes
-        for named_fault in false_faults
+        for named_fault in wrongly_named_faults
     ]
     for score, kind, named_fault in sorted(candidates, key=lambda each: -each[0]):
-        if score and kind not in match_by_kind and named_fault in false_faults:
+        if score and kind not in match_by_kind and named_fault in wrongly_named_faults:
             match_by_kind[kind] = named_fault, score
-            false_faults.remove(named_fault)
+            wrongly_named_faults.remove(named_fault)
     matches = [
         (fault, *match_by_kind.get(fault.kind, (None, 0.0))) for fault in right_answers.mistakes
     ]
-    return matches, false_faults
+    return matches, wrongly_named_faults
 
 
 def score_fault_kind(kind: str, named_kind: str) -> float:
@@ -250,7 +252,7 @@ def score_fault_kind(kind: str, named_kind: str) -> float:
 
 def _score_faults(matches: list[FaultMatch], right_answers: CorrectFormAnswers) -> dict[str, float]:
     """Return the mean score of all injected faults, by part of the answer form."""
-    sized_fault_count = sum(fault.size is not None for fault, _, _ in matches)
+    faults_with_size_count = sum(fault.size is not None for fault, _, _ in matches)
     scores = dict.fromkeys(("mistakes", "sizes", "fault time and panel", "correction"), 0.0)
     for fault, named_fault, score in matches:
         if named_fault is None:
@@ -261,7 +263,7 @@ def _score_faults(matches: list[FaultMatch], right_answers: CorrectFormAnswers) 
         scores["mistakes"] += score / len(matches)
         scores["fault time and panel"] += score_evidence(fault, named_fault) * evidence_weight
         scores["correction"] += score_correction(fault, named_fault, right_answers) * fault_weight
-        scores["sizes"] += size_score / max(sized_fault_count, 1)
+        scores["sizes"] += size_score / max(faults_with_size_count, 1)
     return scores
 
 
@@ -275,7 +277,7 @@ def score_fault_size(fault: InjectedFault, named_fault: NamedFault) -> float:
         is_size_right = fault.low <= stated_size <= fault.high and units[0] == units[1]
         return is_size_right / 3.0
     relative_error = abs(stated_size - fault.size) / abs(fault.size)
-    score_outside_range = 0.5 * (relative_error <= MAX_SIZE_ERROR_HALF_POINTS)
+    score_outside_range = 0.5 * (relative_error <= MAX_RELATIVE_SIZE_ERROR_FOR_HALF_POINTS)
     if fault.kind in GUESSABLE_FAULT_KINDS:
         excess_error = relative_error - (fault.high - fault.low) / (2.0 * abs(fault.size))
         score_outside_range = max(1.0 - excess_error / EXCESS_SIZE_ERROR_AT_ZERO_POINTS, 0.0)
@@ -413,8 +415,8 @@ def _score_number(answer: NumericAnswer, right_answer: NumericAnswer) -> float:
         return max(1.0 - 0.5 * difference_count, 0.0) * has_right_number
     if isinstance(answer, float | int) and isinstance(right_answer, float | int):
         error, magnitude = abs(answer - right_answer), abs(right_answer)
-        if error <= MAX_NUMBER_ERROR_FULL_POINTS * magnitude:
+        if error <= MAX_RELATIVE_NUMBER_ERROR_FOR_FULL_POINTS * magnitude:
             return 1.0
-        if error <= MAX_NUMBER_ERROR_HALF_POINTS * magnitude:
+        if error <= MAX_RELATIVE_NUMBER_ERROR_FOR_HALF_POINTS * magnitude:
             return 0.5
     return 0.0

@@ -27,7 +27,7 @@ from px4fuse.core.text import one_line
 from px4fuse.core.workers import JobFailure, run_with_limits
 from px4fuse.core.writing import write_output_files
 from px4fuse.errors import ResultsError
-from px4fuse.readers.ulog_topics import ignores_assignment_flag
+from px4fuse.readers.ulog_topics import shows_diagnosis_of_assignments
 from px4fuse.results.contract import ReportedResults, find_file_hashes, to_json
 from px4fuse.results.model import provenance
 from px4fuse.results.reading import read_results
@@ -95,7 +95,7 @@ def grade(
     """
     overrides = read_overrides(output / OVERRIDES_NAME)
     for worksheet in course.worksheets:
-        find_grade_column(worksheet, course.column)
+        find_grade_column(worksheet, course.grade_column_title)
     unread_file_notes = [
         f"{one_line(file.name, 80)} was ignored: px4fuse reads only {OVERRIDES_NAME}."
         for file in sorted(output.glob("overrides*"))
@@ -128,8 +128,8 @@ def grade(
                     course.rubric, course.key, reason, HARMFUL_FILE_REMEDY
                 )
             else:
-                report, is_loaded = result
-                reused_count += is_loaded
+                report, is_loaded_from_cache = result
+                reused_count += is_loaded_from_cache
             submission, student = found_submissions[index], report.student
             if not student and not report.student_id:
                 student = submission.origin.person.name
@@ -168,7 +168,7 @@ def grade_submission(
     Returns
     -------
     report : GradedReport
-    is_loaded : bool
+    is_loaded_from_cache : bool
         True if the result of an earlier verification was loaded.
     """
     max_log_bytes.set(max_bytes)
@@ -176,18 +176,18 @@ def grade_submission(
     assigned_hashes = (
         frozenset(answer.sha256 for answer in answer_key.answers) if answer_key else frozenset()
     )
-    sha256, is_loaded = "", False
+    sha256, is_loaded_from_cache = "", False
     try:
         content = submissions.read_submission(submission)
         sha256 = hashlib.sha256(content).hexdigest()
-        results, verification, is_loaded = load_or_verify(
+        results, verification, is_loaded_from_cache = load_or_verify(
             records_folder, content, path_by_sha256, assigned_hashes
         )
     except ResultsError as error:
         graded_report = grade_unreadable_file(rubric, answer_key, f"{error.reason}.", error.remedy)
     else:
         graded_report = score_report(results, verification, rubric, answer_key, submitter_id)
-    return replace(graded_report, sha256=sha256), is_loaded
+    return replace(graded_report, sha256=sha256), is_loaded_from_cache
 
 
 # ------------------------------------------------------------------ cache of verifications
@@ -234,7 +234,7 @@ def load_or_verify(
     results : ComparisonResults or LoopResults
         Results of the report.
     verification : Verification
-    is_loaded : bool
+    is_loaded_from_cache : bool
         True if an earlier result was loaded.
 
     Raises
@@ -284,11 +284,11 @@ def repeat_analysis_with_diagnosis(
 
     Return results and report (PDF).
     """
-    token = ignores_assignment_flag.set(True)
+    token = shows_diagnosis_of_assignments.set(True)
     try:
         outcome = recompute_report(results, path_by_sha256)
     finally:
-        ignores_assignment_flag.reset(token)
+        shows_diagnosis_of_assignments.reset(token)
     if isinstance(outcome, Verification):
         raise ResultsError(f"No diagnosis report for the student: {'; '.join(outcome.reasons)}.")
     diagnosed_results, draw = outcome

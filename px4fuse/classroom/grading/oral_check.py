@@ -34,22 +34,22 @@ def ask_about_form(
     answers: Answers, right_answers: CorrectFormAnswers
 ) -> Iterator[QuestionAndAnswer]:
     """Yield questions about the faults and figures in a student's answers, wrong answers first."""
-    named_kinds = [fault.kind for fault in answers.mistakes]
-    true_kinds = [fault.kind for fault in right_answers.mistakes]
-    for kind in named_kinds:
-        if kind not in (*true_kinds, NO_FAULT_KIND):
+    kinds_named_by_student = [fault.kind for fault in answers.mistakes]
+    injected_fault_kinds = [fault.kind for fault in right_answers.mistakes]
+    for kind in kinds_named_by_student:
+        if kind not in (*injected_fault_kinds, NO_FAULT_KIND):
             yield (
                 f"You named {kind} ({FAULT_KINDS[kind].description}). Which plot would show this "
                 "fault? Does your report show the fault in this plot?",
                 f"{kind} would be visible in {' or '.join(find_panels_showing_fault(kind))}. "
-                f"Injected fault of the flight: {', '.join(true_kinds) or 'no fault'}.",
+                f"Injected fault of the flight: {', '.join(injected_fault_kinds) or 'no fault'}.",
             )
     for fault in right_answers.mistakes:
         description, panels = (
             FAULT_KINDS[fault.kind].description,
             find_panels_showing_fault(fault.kind),
         )
-        if fault.kind not in named_kinds:
+        if fault.kind not in kinds_named_by_student:
             yield (
                 f"Your flight also has this fault: {description}. Show this fault in a plot of "
                 "your report. State size and time of the fault.",

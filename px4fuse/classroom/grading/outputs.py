@@ -86,7 +86,7 @@ LIST_SEPARATOR = " | "
 MAX_LISTED_REASONS = 4
 # Titles of grade columns in tables of learning platforms, as lower-case letters and digits
 GRADE_COLUMN_TITLES = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
-MAX_GRADE_COLUMN_TITLES = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
+TITLES_OF_MAX_GRADE_COLUMN = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
 # Titles of feedback columns that contain HTML (Moodle)
 HTML_COMMENT_COLUMN_TITLES = ("feedbackcomments", "feedbackalskommentar")
 # Titles of all feedback columns
@@ -120,19 +120,21 @@ def write_grading_files(
     """
     class_title = course.title or course.rubric.title or "Class"
     file_stems = make_file_names(grade.student_id or Path(grade.file_name).stem for grade in grades)
-    page_grades = [
+    class_page_grades = [
         _copy_redrawn_report(grade, stem, output)
         for grade, stem in zip(grades, file_stems, strict=True)
     ]
-    has_redrawn_reports = any(report.redrawn_report_path for report in counted_reports(page_grades))
+    has_redrawn_reports = any(
+        report.redrawn_report_path for report in counted_reports(class_page_grades)
+    )
     feedback_texts = [feedback_text(grade, class_title) for grade in grades]
     texts = {"class.csv": format_class_table(grades)}
     if course.anonymous:
-        page_grades, texts[PSEUDONYMS_FILE] = _anonymise_grades(
-            page_grades, output / PSEUDONYMS_FILE
+        class_page_grades, texts[PSEUDONYMS_FILE] = _anonymise_grades(
+            class_page_grades, output / PSEUDONYMS_FILE
         )
     texts["class.html"] = format_class_page(
-        page_grades, class_title, f"px4fuse {metadata.version('px4fuse')}"
+        class_page_grades, class_title, f"px4fuse {metadata.version('px4fuse')}"
     )
     if course.question_count and course.key is not None:
         texts[QUESTIONS_FILE] = format_questions(grades, course.key, course.question_count)
@@ -145,7 +147,12 @@ def write_grading_files(
     table_names = make_unique((sheet.path.name for sheet in course.worksheets), "{1}-{0}")
     for sheet, name in zip(course.worksheets, table_names, strict=True):
         filled_sheet, sheet_notes = fill_grades(
-            sheet, grades, course.class_list, course.column, feedback_texts, course.scale
+            sheet,
+            grades,
+            course.class_list,
+            course.grade_column_title,
+            feedback_texts,
+            course.scale,
         )
         contents[f"{GRADES_FOLDER}/{name}"] = filled_sheet.content()
         notes += sheet_notes
@@ -295,14 +302,14 @@ def _format_csv(titles: Sequence[str], rows: Iterable[Sequence[str | float | Non
 def feedback_text(grade: Grade, class_name: str = "") -> str:
     """Format points, comments and reasons for one student as text, without flags."""
     report = grade.counted_report
-    is_total_set = TOTAL_TITLE in grade.overrides
+    is_total_set_by_instructor = TOTAL_TITLE in grade.overrides
     lines = [class_name] if class_name else []
     if report is None:
         lines.append("No submission.")
     else:
         # the computed points are not printed if the instructor has set the total
         lines += _format_report_feedback(
-            report, bool(report.items) and (grade.total is None or not is_total_set)
+            report, bool(report.items) and (grade.total is None or not is_total_set_by_instructor)
         )
     lines.append("")
     if grade.deducted_points:
@@ -310,7 +317,7 @@ def feedback_text(grade: Grade, class_name: str = "") -> str:
             f"Handed in {(grade.lateness_s or 0.0) / 3600.0:.1f} hours late: "
             f"{format_cell_number(grade.deducted_points)} points deducted."
         )
-    if grade.total is not None and (grade.deducted_points or is_total_set):
+    if grade.total is not None and (grade.deducted_points or is_total_set_by_instructor):
         lines.append(f"Total    {_format_points(grade.total, grade.max_points)}")
     if grade.comment:
         lines += ["", "From your instructor:", "", grade.comment]
@@ -490,12 +497,12 @@ def fill_grades(
 
 
 def _find_max_points(sheet: Sheet, row: Sequence[str], grade_column_index: int) -> float | None:
-    maximum_texts = (
+    max_points_texts = (
         cells[grade_column_index]
         for cells in sheet.rows[:3]
         if "points possible" in cells[0].casefold()
     )
-    return parse_decimal(next(maximum_texts, sheet.find_cell(row, MAX_GRADE_COLUMN_TITLES)))
+    return parse_decimal(next(max_points_texts, sheet.find_cell(row, TITLES_OF_MAX_GRADE_COLUMN)))
 
 
 def escape_html(text: str) -> str:

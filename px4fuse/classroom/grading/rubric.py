@@ -75,7 +75,7 @@ else:
     # union of all subclasses; the field "check" in the TOML file selects the subclass
     AnyRubricItem = Union[tuple(RubricItem.__subclasses__())]  # noqa: UP007
 # Rule for the points of a report; "pending" points need a decision of the instructor
-PointsRule = Literal["pending", "zero", "count"]
+ReportPointsRule = Literal["pending", "zero", "count"]
 
 
 class Rubric(Record, kw_only=True):
@@ -93,8 +93,8 @@ class Rubric(Record, kw_only=True):
 
     title: Text = ""
     unverified: Literal["pending", "zero"] = "pending"
-    others_log: PointsRule = "pending"
-    pages: PointsRule = "count"
+    others_log: ReportPointsRule = "pending"
+    pages: ReportPointsRule = "count"
     items: Annotated[tuple[AnyRubricItem, ...], Meta(min_length=1, max_length=100)] = msgspec.field(
         name="item"
     )
@@ -180,9 +180,9 @@ def score_report(
                 is_awaiting_points,
             )
         )
-    form_result, values = scoring_input.form_points, scoring_input.values
-    if isinstance(form_result, str) or not scoring_input.is_own_log:
-        form_result = FormPoints()
+    form_points_or_reason, values = scoring_input.form_points, scoring_input.values
+    if isinstance(form_points_or_reason, str) or not scoring_input.is_own_log:
+        form_points_or_reason = FormPoints()
     pending_actions = [action for rule, _, action in problems if rule == "pending"]
     flags = []
     if verification.pages:
@@ -203,8 +203,8 @@ def score_report(
         tuple(graded_items),
         flags=tuple(flags),
         instructor_action="" if zero_points_reasons else " ".join(pending_actions),
-        did_student_name_fault=form_result.did_student_name_fault,
-        form_part_scores=form_result.parts,
+        did_student_name_fault=form_points_or_reason.did_student_name_fault,
+        form_part_scores=form_points_or_reason.parts,
         form=scoring_input.form if isinstance(scoring_input.form, Answers) else None,
         numbers={
             title: float(values[path]) for title, path in CLASS_TABLE_NUMBERS if path in values
@@ -217,7 +217,7 @@ def score_report(
 
 def _find_problems(
     scoring_input: ScoringInput, rubric: Rubric
-) -> Iterator[tuple[PointsRule, str, str]]:
+) -> Iterator[tuple[ReportPointsRule, str, str]]:
     """Yield rule, reason for the student and action of the instructor for each problem."""
     verification = scoring_input.verification
     reason_text = format_reason("".join(verification.reasons[:1]))

@@ -18,8 +18,8 @@ from px4fuse.trajectory.rotation import build_matrix, skew
 SMALL_ANGLE_RAD = 0.3
 # Power series in theta^2 of f(theta) = (1 - theta/2 cot(theta/2)) / theta^2 and of f'(theta) /
 # theta
-_SQUARE_FACTOR_SERIES = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
-_SQUARE_FACTOR_SLOPE_SERIES = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
+_SQUARE_TERM_FACTOR_SERIES = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
+_SQUARE_TERM_FACTOR_SLOPE_SERIES = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
 
 
 def wrap(angle: Array) -> Array:
@@ -132,16 +132,16 @@ def right_jacobian_inverse(tangent: Array) -> Array:
     commutator = _compute_commutator(tangent)
     commutator_squared = commutator @ commutator
     theta = np.linalg.norm(tangent[..., _get_dimension(tangent) :], axis=-1)[..., None, None]
-    square_factor = _compute_square_factor(theta)
-    half_square_factor_slope = 0.5 * _compute_square_factor_slope(theta)
+    square_term_factor = _compute_square_term_factor(theta)
+    half_square_term_factor_slope = 0.5 * _compute_square_term_factor_slope(theta)
     # Power series of x / (1 - exp(-x)) for the commutator matrix x = ad, with the identity
     # ad^5 = -2 theta^2 ad^3 - theta^4 ad
     jacobian: Array = (
         np.eye(commutator.shape[-1])
         + 0.5 * commutator
-        + (square_factor - theta * theta * half_square_factor_slope) * commutator_squared
+        + (square_term_factor - theta * theta * half_square_term_factor_slope) * commutator_squared
     )
-    return jacobian - half_square_factor_slope * (commutator_squared @ commutator_squared)
+    return jacobian - half_square_term_factor_slope * (commutator_squared @ commutator_squared)
 
 
 def _compute_commutator(tangent: Array) -> Array:
@@ -209,27 +209,29 @@ def _left_jacobian_inverse(phi: Array) -> Array:
     return (
         np.eye(skew_matrix.shape[-1])
         - 0.5 * skew_matrix
-        + _compute_square_factor(np.linalg.norm(phi, axis=-1)[..., None, None])
+        + _compute_square_term_factor(np.linalg.norm(phi, axis=-1)[..., None, None])
         * (skew_matrix @ skew_matrix)
     )
 
 
-def _compute_square_factor(theta: Array) -> Array:
+def _compute_square_term_factor(theta: Array) -> Array:
     """Return f(theta) = (1 - theta/2 cot(theta/2)) / theta^2."""
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
     closed_form_value = (1.0 - 0.5 * t / np.tan(0.5 * t)) / t**2
     return np.where(
-        theta < SMALL_ANGLE_RAD, polyval(theta * theta, _SQUARE_FACTOR_SERIES), closed_form_value
+        theta < SMALL_ANGLE_RAD,
+        polyval(theta * theta, _SQUARE_TERM_FACTOR_SERIES),
+        closed_form_value,
     )
 
 
-def _compute_square_factor_slope(theta: Array) -> Array:
+def _compute_square_term_factor_slope(theta: Array) -> Array:
     """Return f'(theta) / theta, for f(theta) = (1 - theta/2 cot(theta/2)) / theta^2."""
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
     half_cot_derivative = 0.5 / np.tan(0.5 * t) - 0.25 * t / np.sin(0.5 * t) ** 2
     closed_form_value = -(half_cot_derivative + 2.0 * (1.0 - 0.5 * t / np.tan(0.5 * t)) / t) / t**3
     return np.where(
         theta < SMALL_ANGLE_RAD,
-        polyval(theta * theta, _SQUARE_FACTOR_SLOPE_SERIES),
+        polyval(theta * theta, _SQUARE_TERM_FACTOR_SLOPE_SERIES),
         closed_form_value,
     )

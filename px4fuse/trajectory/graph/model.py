@@ -159,13 +159,13 @@ def find_odometry_edges(graph: PoseGraph, excluded_edges: IntArray | None = None
     odometry_edges = np.flatnonzero(graph.find_successive_edges())
     if excluded_edges is not None:
         odometry_edges = np.setdiff1d(odometry_edges, excluded_edges)
-    next_edge_indices = np.full(len(graph) - 1, -1, dtype=np.intp)
+    edge_indices_to_next_pose = np.full(len(graph) - 1, -1, dtype=np.intp)
     # NumPy keeps the last assignment to an index, so this order keeps the first edge
     odometry_edges = odometry_edges[::-1]
-    next_edge_indices[
+    edge_indices_to_next_pose[
         np.minimum(graph.first_nodes[odometry_edges], graph.second_nodes[odometry_edges])
     ] = odometry_edges
-    return next_edge_indices
+    return edge_indices_to_next_pose
 
 
 def get_odometry_steps(graph: PoseGraph, edge_indices: IntArray) -> Array:

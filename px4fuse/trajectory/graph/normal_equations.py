@@ -22,16 +22,16 @@ _MAX_LEAF_UNKNOWNS = 96
 _FIXED_POSE_INFORMATION = 1e100
 
 
-class _Front(NamedTuple):
+class _FrontalMatrix(NamedTuple):
     """Dense matrix in which a group of poses is eliminated together (supernode)."""
 
     # Range of the unknowns that are eliminated in this front, and indices of the other unknowns in
     # their equations, which are eliminated later
     unknowns: slice
-    later_unknowns: IntArray
+    remaining_unknowns: IntArray
     # Range of this front's matrix elements in the flat array of all fronts
-    elements: slice
-    # Index of the parent front in the elimination tree, and rows of ``later_unknowns`` in the
+    slice_of_matrix_elements: slice
+    # Index of the parent front in the elimination tree, and rows of ``remaining_unknowns`` in the
     # matrix of the parent front
     parent_index: int
     rows_in_parent: IntArray
@@ -50,14 +50,16 @@ class NormalEquations:
     """
 
     def __init__(self, edges: IntArray, unknowns_per_pose: int) -> None:
-        position, group_starts, later_poses_by_group = _find_elimination_order(
+        position, group_starts, remaining_poses_by_group = _find_elimination_order(
             edges, _MAX_LEAF_UNKNOWNS // unknowns_per_pose
         )
         poses, offsets_in_pose = np.arange(len(position)), np.arange(unknowns_per_pose)
-        groups, pose_counts = np.arange(len(later_poses_by_group)), np.diff(group_starts)
+        groups, pose_counts = np.arange(len(remaining_poses_by_group)), np.diff(group_starts)
         group_by_pose = np.repeat(groups, pose_counts)
         rows_by_group = [
-            np.append(poses[slice(*group_starts[group : group + 2])], later_poses_by_group[group])
+            np.append(
+                poses[slice(*group_starts[group : group + 2])], remaining_poses_by_group[group]
+            )
             for group in groups
         ]
         row_counts = np.array([len(rows) for rows in rows_by_group])
@@ -68,9 +70,9 @@ class NormalEquations:
         column_counts = pose_counts * unknowns_per_pose
         element_starts = np.append(0, np.cumsum(row_counts * unknowns_per_pose * column_counts))
 
-        def find_rows(group: IntArray, pose: IntArray) -> IntArray:
+        def find_rows(group: IntArray, pose_index: IntArray) -> IntArray:
             """Return the rows of each pose in the front of ``group``, shape (n, d)."""
-            row = np.searchsorted(keys_of_group_and_row, group * len(poses) + pose)
+            row = np.searchsorted(keys_of_group_and_row, group * len(poses) + pose_index)
             return np.asarray(
                 (row - row_starts[group])[:, None] * unknowns_per_pose + offsets_in_pose
             )
@@ -93,15 +95,15 @@ class NormalEquations:
         self._position = position
         self._diagonal = np.diagonal(diagonal_blocks, axis1=1, axis2=2)
         self._fronts = []
-        for group, later_poses in enumerate(later_poses_by_group):
-            parent_index = int(group_by_pose[later_poses[0]]) if len(later_poses) else group
+        for group, remaining_poses in enumerate(remaining_poses_by_group):
+            parent_index = int(group_by_pose[remaining_poses[0]]) if len(remaining_poses) else group
             self._fronts.append(
-                _Front(
+                _FrontalMatrix(
                     slice(*group_starts[group : group + 2] * unknowns_per_pose),
-                    (later_poses[:, None] * unknowns_per_pose + offsets_in_pose).ravel(),
+                    (remaining_poses[:, None] * unknowns_per_pose + offsets_in_pose).ravel(),
                     slice(*element_starts[group : group + 2]),
                     parent_index,
-                    find_rows(np.full(len(later_poses), parent_index), later_poses).ravel(),
+                    find_rows(np.full(len(remaining_poses), parent_index), remaining_poses).ravel(),
                 )
             )
 
@@ -150,10 +152,10 @@ class NormalEquations:
         schur_complements = defaultdict[int, list[tuple[IntArray, Array]]](list)
         factors = []
         for index, front in enumerate(self._fronts):
-            unknowns, later_unknowns = front.unknowns, front.later_unknowns
+            unknowns, remaining_unknowns = front.unknowns, front.remaining_unknowns
             size = unknowns.stop - unknowns.start
-            matrix = np.zeros((size + len(later_unknowns),) * 2)
-            matrix[:, :size] = matrix_elements[front.elements].reshape(-1, size)
+            matrix = np.zeros((size + len(remaining_unknowns),) * 2)
+            matrix[:, :size] = matrix_elements[front.slice_of_matrix_elements].reshape(-1, size)
             for rows, schur_complement in schur_complements.pop(index, ()):
                 matrix[rows[:, None], rows] += schur_complement
             cholesky_factor, failed_row = lapack.dpotrf(matrix[:size, :size].T)
@@ -161,7 +163,7 @@ class NormalEquations:
                 return None
             solution[unknowns] = blas.dtrsm(1.0, cholesky_factor, solution[unknowns], trans_a=1)
             off_diagonal_factor = matrix[size:, :size].T
-            if len(later_unknowns):
+            if len(remaining_unknowns):
                 off_diagonal_factor = blas.dtrsm(
                     1.0, cholesky_factor, off_diagonal_factor, trans_a=1
                 )
@@ -172,10 +174,10 @@ class NormalEquations:
                 schur_complements[front.parent_index].append(
                     (front.rows_in_parent, schur_complement)
                 )
-                solution[later_unknowns] -= off_diagonal_factor.T @ solution[unknowns]
-            factors.append((unknowns, later_unknowns, cholesky_factor, off_diagonal_factor))
-        for unknowns, later_unknowns, cholesky_factor, off_diagonal_factor in reversed(factors):
-            terms_of_solved_unknowns = off_diagonal_factor @ solution[later_unknowns]
+                solution[remaining_unknowns] -= off_diagonal_factor.T @ solution[unknowns]
+            factors.append((unknowns, remaining_unknowns, cholesky_factor, off_diagonal_factor))
+        for unknowns, remaining_unknowns, cholesky_factor, off_diagonal_factor in reversed(factors):
+            terms_of_solved_unknowns = off_diagonal_factor @ solution[remaining_unknowns]
             solution[unknowns] = blas.dtrsm(
                 1.0, cholesky_factor, solution[unknowns] - terms_of_solved_unknowns
             )
@@ -195,8 +197,8 @@ def _find_elimination_order(
         Index of each pose in the order of elimination.
     group_starts : ndarray of int, shape (g + 1,)
         Index of the first pose of each group, and n.
-    later_poses_by_group : list of ndarray of int
-        Later poses in the equations of each group.
+    remaining_poses_by_group : list of ndarray of int
+        Poses in the equations of each group that are eliminated later.
     """
     rows = np.tile(np.arange(edges.shape[1]), 2)
     incidence_matrix = sparse.csc_array(
@@ -228,20 +230,20 @@ def _find_elimination_order(
     nonzero_counts = nonzero_counts[elimination_order]
     parent = np.append(position[parent[elimination_order[:-1]]], pose_count)
     subtree_size = np.ones(pose_count + 1, dtype=np.intp)
-    for pose, pose_parent in enumerate(parent.tolist()):
-        subtree_size[pose_parent] += subtree_size[pose]
+    for pose_index, pose_parent in enumerate(parent.tolist()):
+        subtree_size[pose_parent] += subtree_size[pose_index]
     is_large_subtree = subtree_size > max_poses_per_leaf_group
     is_large_subtree[pose_count] = True
-    leaf_group_ends = np.flatnonzero(~is_large_subtree[:-1] & is_large_subtree[parent])
+    leaf_subtree_ends = np.flatnonzero(~is_large_subtree[:-1] & is_large_subtree[parent])
     # A pose is merged with its child in the elimination tree if their columns of the Cholesky
     # factor have the same nonzero rows
     is_parent_next = parent[:-1] == np.arange(1, pose_count)
     is_merged_with_child = is_large_subtree[:-2] & is_parent_next & (np.diff(nonzero_counts) == -1)
     is_group_start = is_large_subtree[:-1] & ~np.append(False, is_merged_with_child)
-    is_group_start[leaf_group_ends - subtree_size[leaf_group_ends] + 1] = True
+    is_group_start[leaf_subtree_ends - subtree_size[leaf_subtree_ends] + 1] = True
     group_starts = np.append(np.flatnonzero(is_group_start), pose_count)
-    later_poses_by_group = [
-        np.sort(position[factor.indices[slice(*factor.indptr[pose : pose + 2])]])[1:]
-        for pose in elimination_order[group_starts[1:] - 1]
+    remaining_poses_by_group = [
+        np.sort(position[factor.indices[slice(*factor.indptr[pose_index : pose_index + 2])]])[1:]
+        for pose_index in elimination_order[group_starts[1:] - 1]
     ]
-    return position[lu_factors.perm_c], group_starts, later_poses_by_group
+    return position[lu_factors.perm_c], group_starts, remaining_poses_by_group

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import chdtri, gammaincinv
 
 from px4fuse.core.arrays import Array, BoolArray
-from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Record
+from px4fuse.core.record import NOT_IN_JSON, Count, NotInJson, NotNegative, Record
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.graph import lie, model
@@ -52,7 +52,7 @@ KEPT_CLOSURE_PROBABILITY = 0.999
 _GNC_CONTROL_FACTOR = 1.4
 _MAX_GNC_STAGES = 100
 # Maximum number of loop closures that are tested again after graduated non-convexity rejected them
-_MAX_RESTORE_ATTEMPTS = 20
+_MAX_TRIALS_TO_RESTORE_CLOSURES = 20
 _MAX_REWEIGHTING_ROUNDS = 20
 # Information matrices are divided by the factor by which they seem too large, if this factor is at
 # least the following value. False closures alone can cause smaller factors
@@ -76,9 +76,9 @@ class Solution(Record, kw_only=True):
     # Number of edges with a weight below 0.5
     dropped: Count
     # Optimised poses; the first pose is fixed
-    poses: NotWritten[Array] = NOT_WRITTEN
+    poses: NotInJson[Array] = NOT_IN_JSON
     # Weight of each edge, from 0 (ignored) to 1
-    weights: NotWritten[Array] = NOT_WRITTEN
+    weights: NotInJson[Array] = NOT_IN_JSON
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def solve(
         The graph has no edges, is not connected, or contains a number that is not finite.
     """
     model.require_connected(graph, np.ones(len(graph.first_nodes), bool), "the edges")
-    can_be_false = ~graph.find_successive_edges() if is_closure is None else is_closure
+    can_be_false_closure = ~graph.find_successive_edges() if is_closure is None else is_closure
     start_residuals = model.residuals(graph, graph.poses)
     cost_initial = 0.5 * float(np.sum(start_residuals.chi2))
     if not np.isfinite(cost_initial):
@@ -116,10 +116,10 @@ def solve(
             "The cost of the pose graph is not finite: a pose or measurement is too large",
             "Correct the pose or measurement, or remove its line.",
         )
-    weights = np.ones(len(can_be_false))
+    weights = np.ones(len(can_be_false_closure))
     optimum = _minimise(graph, start_residuals, weights)
-    if robust and np.any(can_be_false):
-        optimum, weights = _solve_gnc(graph, start_residuals, optimum, can_be_false)
+    if robust and np.any(can_be_false_closure):
+        optimum, weights = _solve_gnc(graph, start_residuals, optimum, can_be_false_closure)
     return Solution(
         poses=optimum.residuals.poses,
         cost=0.5 * float(np.sum(weights * optimum.residuals.chi2)),
@@ -190,12 +190,12 @@ def _solve_gnc(
     graph: PoseGraph,
     start_residuals: Residuals,
     unweighted_optimum: _Optimum,
-    can_be_false: BoolArray,
+    can_be_false_closure: BoolArray,
 ) -> tuple[_Optimum, Array]:
     """Reject false closures by graduated non-convexity; return the optimum and the edge weights."""
     half_degrees_of_freedom = model.count_observed_directions(graph.information) / 2.0
     chi2_bound = np.where(
-        can_be_false & (half_degrees_of_freedom > 0.0),
+        can_be_false_closure & (half_degrees_of_freedom > 0.0),
         2.0 * gammaincinv(half_degrees_of_freedom, GNC_INLIER_PROBABILITY),
         np.inf,
     )
@@ -213,7 +213,7 @@ def _solve_gnc(
     lowest_cost, optimum, weights = min(solutions, key=lambda solution: solution[0])
     dropped_edges = np.flatnonzero(weights == 0.0)
     for edge_index in dropped_edges[np.argsort(optimum.residuals.chi2[dropped_edges])][
-        :_MAX_RESTORE_ATTEMPTS
+        :_MAX_TRIALS_TO_RESTORE_CLOSURES
     ]:
         trial_weights = weights.copy()
         trial_weights[edge_index] = 1.0
