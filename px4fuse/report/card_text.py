@@ -332,7 +332,7 @@ def make_rerun_rows(reruns: Sequence[CardRerun]) -> list[list[str]]:
     """Return the table (first row: headings) of re-runs with changed settings."""
     rows = [
         {
-            "filter and tested change": rerun.label,
+            "re-run": rerun.label,
             "position RMSE": _format_before_after(rerun.position_rmse_m, format_metres, " m"),
             "● innovation ÷ √S": _format_before_after(rerun.source_ratio, format_ratio),
             "◆ error ÷ σ": _format_before_after(rerun.truth_ratio, format_ratio),
