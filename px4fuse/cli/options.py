@@ -27,7 +27,7 @@ from px4fuse.core.reading import (
     read_text,
     split_path_and_part,
 )
-from px4fuse.core.text import UNIT_NAMES, convert_to_unit, replace_unencodable
+from px4fuse.core.text import UNIT_NAME_BY_SYMBOL, convert_to_unit, replace_unencodable
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import SETTING_RANGES
 from px4fuse.request import AUTO, OPTION_NAMES, UNIT_BY_SUFFIX, ComparisonRequest, PositionFile
@@ -93,7 +93,7 @@ class NumberWithUnit(click.ParamType["float | str"]):
         except ValueError:
             message = f"{value!r} is not a number"
             if self.unit:
-                message += f" in {UNIT_NAMES.get(self.unit, self.unit)}"
+                message += f" in {UNIT_NAME_BY_SYMBOL.get(self.unit, self.unit)}"
             if self.accepts_auto:
                 message += " or auto"
             if (converted_number := convert_to_unit(value, self.unit)) is not None:

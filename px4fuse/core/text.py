@@ -1,4 +1,4 @@
-"""Formatting and parsing of numbers and texts, and conversion of data classes for JSON."""
+"""Formatting, parsing and escaping of texts and numbers, and data classes converted for JSON."""
 
 import math
 import re
@@ -18,7 +18,7 @@ from px4fuse.core.record import read_toml
 
 _UNIT_TABLES = read_toml(__file__, dict[str, dict[str, Any]], "units.toml")
 # Full name of each unit, by its symbol
-UNIT_NAMES: Mapping[str, str] = _UNIT_TABLES["names"]
+UNIT_NAME_BY_SYMBOL: Mapping[str, str] = _UNIT_TABLES["names"]
 # Conversion factors to the base unit of each quantity
 _UNIT_FACTORS: Mapping[str, Mapping[str, float]] = _UNIT_TABLES["typed"]
 _NUMBER_WITH_UNIT = re.compile(r"([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*(\S*)", re.IGNORECASE)

@@ -47,14 +47,15 @@ class Aid:
     fields: str = ""
     # Fields of the topic ekf2_innovations (PX4 v1.8 to v1.10)
     ekf2_innovations_fields: str = ""
-    # Flags of the topic estimator_status_flags that are 1 while fusion is enabled
+    # Flags of the topic estimator_status_flags that are 1 while fusion is enabled; by default
+    # cs_NAME. PX4 has no such flag for auxiliary velocity
     flags: tuple[str, ...] = ()
     # Bit of estimator_status.control_mode_flags that is 1 while fusion is enabled
     status_bit: int | None = None
 
     @property
     def measurement_parameters(self) -> tuple[str, ...]:
-        """Names of the PX4 parameters for noise, delay and gate."""
+        """Names of the PX4 parameters for noise, delay, gate and noise mode."""
         return self.noise, self.delay, self.gate, self.noise_mode_parameter
 
     def logged_parameters(self, logged_values: Mapping[str, float]) -> dict[str, float]:

@@ -97,9 +97,13 @@ POSITION_MESSAGE_TYPES = tuple(
     for name, row in _MESSAGE_TABLES["positions"].items()
 )
 HIGHRES_IMU_LAYOUT = MESSAGE_LAYOUTS["HIGHRES_IMU"]
-IMU_LAYOUTS = [HIGHRES_IMU_LAYOUT] + [
-    replace(MESSAGE_LAYOUTS["SCALED_IMU"], topic=f"SCALED_IMU{number}") for number in ("", "2", "3")
-]
+# IMU messages; HIGHRES_IMU, or else the message with most samples, is used
+IMU_LAYOUTS = (
+    HIGHRES_IMU_LAYOUT,
+    MESSAGE_LAYOUTS["SCALED_IMU"],
+    replace(MESSAGE_LAYOUTS["SCALED_IMU"], topic="SCALED_IMU2"),
+    replace(MESSAGE_LAYOUTS["SCALED_IMU"], topic="SCALED_IMU3"),
+)
 # Attitude messages; the message with most samples is used
 ATTITUDE_LAYOUTS = (
     MESSAGE_LAYOUTS["ATTITUDE_QUATERNION"],

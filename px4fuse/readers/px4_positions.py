@@ -184,7 +184,8 @@ def _make_ulog_track(
     source = TRACK_SOURCES[name]
     origin = structs.replace(source.origin, is_selectable_by_default=is_selectable_by_default)
     if origin.aid is not None:
-        lever_arm_m = tuple(topics.ekf2_parameters.get(name, 0.0) for name in origin.aid.lever_arm)
+        parameters = topics.ekf2_parameters
+        lever_arm_m = tuple(parameters.get(parameter, 0.0) for parameter in origin.aid.lever_arm)
         track_fields = {"lever_arm_m": lever_arm_m, **track_fields}
     fields = {"frame": "NED", "clock": AUTOPILOT_CLOCK_TEXT, **track_fields}
     fields |= {"description": source.description, "topics": topic_names, "log": topics.log.name}
@@ -561,8 +562,9 @@ def find_motion_capture_truth(positions: tuple[PositionTrack, ...]) -> Truth | N
 
     Motion capture in FRD is not used, because its north direction is unknown.
     """
-    has_vision = any(track.origin.is_vision for track in positions)
-    for track in positions if has_vision else ():
+    if not any(track.origin.is_vision for track in positions):
+        return None
+    for track in positions:
         if track.origin.kind == "mocap" and track.frame != "FRD":
             samples = track.samples.reindex(columns=Columns.STATE)
             return Truth(track.name, samples, read_attitude(track.orientation))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from px4fuse.core.record import read_toml
-from px4fuse.core.text import UNIT_NAMES, convert_to_unit
+from px4fuse.core.text import UNIT_NAME_BY_SYMBOL, convert_to_unit
 from px4fuse.errors import SettingsError, suggest_name
 from px4fuse.simulation.scenario import (
     SCENARIO_KINDS,
@@ -170,7 +170,7 @@ def parse_faults(texts: Iterable[str]) -> FaultSizes:
             if size is None:
                 raise SettingsError(
                     f"--mistake {option_text}: {value_text!r} is not a valid value: give "
-                    f"{UNIT_NAMES[bounds.unit]}, as in {name}{fault_type.usage}."
+                    f"{UNIT_NAME_BY_SYMBOL[bounds.unit]}, as in {name}{fault_type.usage}."
                 )
             bounds.check(size, f"--mistake {option_text}: {bounds.help_or_placeholder}")
             value_by_field[field_name] = size
