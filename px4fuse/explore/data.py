@@ -69,7 +69,8 @@ class ArrayEncoder:
 
     def text(self) -> str:
         """Return all arrays as one base64 text of compressed JSON."""
-        return base64.b64encode(zlib.compress(json.dumps(self._encoded_arrays).encode())).decode()
+        text = json.dumps(self._encoded_arrays, separators=(",", ":"))
+        return base64.b64encode(zlib.compress(text.encode(), 9)).decode()
 
 
 def make_flight_data(analysis: Analysis, encoder: ArrayEncoder) -> PageData:

@@ -47,20 +47,24 @@ const Engine = (() => {
       if (t >= start && t <= end) { all.push(t); z.push(axis.z[i]); }
     }
     if (all.length < MIN_MEASUREMENTS) return null;
-    // rows [time, index of the measurement, or -1]; of several measurements at the same time, the last is used
+    // of several measurements at the same time, the last is used
     const first = all[0], updates = [];
     for (let i = 1; i < all.length; i++) {
       if (all[i] <= first + SAME_TIME_S) continue;
-      if (updates.at(-1)?.[0] === all[i]) updates.pop();
-      updates.push([all[i], i]);
+      if (updates.at(-1)?.t === all[i]) updates.pop();
+      updates.push({ t: all[i], measurement: i });
     }
     if (!updates.length) return null;
-    const count = Math.floor((updates.at(-1)[0] - first) / settings.dt_s + 1e-9) + 1;
-    const grid = Array.from({ length: count }, (_, k) => [first + settings.dt_s * k, -1]);
-    const rows = [...updates, ...grid].sort(([a], [b]) => a - b);
-    const isUpdateAt = (t, row) => row?.[1] >= 0 && Math.abs(row[0] - t) <= SAME_TIME_S;
-    const steps = rows.filter(([t, i], k) => i >= 0 || !isUpdateAt(t, rows[k - 1]) && !isUpdateAt(t, rows[k + 1]));
-    return { time: Float64Array.from(steps, ([t]) => t), measurement: steps.map(([, i]) => i), z, updates: updates.length };
+    const count = Math.floor((updates.at(-1).t - first) / settings.dt_s + 1e-9) + 1;
+    const grid = Array.from({ length: count }, (_, k) => ({ t: first + settings.dt_s * k, measurement: -1 }));
+    const rows = [...updates, ...grid].sort((a, b) => a.t - b.t);
+    // a time of the grid is omitted if a measurement has the same time
+    const isUpdateAt = (t, row) => row?.measurement >= 0 && Math.abs(row.t - t) <= SAME_TIME_S;
+    const steps = rows.filter(({ t, measurement }, k) =>
+      measurement >= 0 || !isUpdateAt(t, rows[k - 1]) && !isUpdateAt(t, rows[k + 1]));
+    return {
+      time: Float64Array.from(steps.map(({ t }) => t)), measurement: steps.map(({ measurement }) => measurement),
+      z, updates: updates.length };
   }
 
   /* Mean acceleration (m/s²) of each KF step, and its additional variance in IMU gaps */

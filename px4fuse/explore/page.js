@@ -146,7 +146,7 @@ const Explore = (async () => {
   }
 
   // ------------------------------------------------------------------ KF run and its numbers
-  // `run` and `numbers` of KF are null if the analysed segment has too few measurements
+  // latest `run` of KF, its `axis` and its `numbers`; without enough measurements, `run` and `numbers` are null
   const result = {};
   /* Statistics of a KF run: innovations, difference to EKF2 and error against ground truth, at the times of EKF2's state */
   function numbers(axis, run) {

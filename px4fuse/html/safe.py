@@ -57,12 +57,12 @@ def make_relative_url(path: str) -> str:
 
 @cache
 def load_template(name: str) -> Template:
-    """Load a Jinja template that cleans and escapes all inserted text."""
+    """Load a Jinja template that cleans, shortens and escapes all inserted text."""
     environment = Environment(
         loader=PackageLoader("px4fuse", ""),
         autoescape=True,
         trim_blocks=True,
-        finalize=lambda value: clean_text(value) if type(value) is str else value,
+        finalize=lambda value: clean_values(value) if type(value) is str else value,
         undefined=StrictUndefined,
     )
     return environment.get_template(name)

@@ -348,7 +348,10 @@ def solve_pose_graphs(
 def _correct_path(
     path: Trajectory, node_indices: IntArray, graph_poses: Array, solution: Solution
 ) -> tuple[Trajectory, Solution]:
-    """Correct each pose of a path by interpolation of the corrections of the graph nodes."""
+    """Correct each pose of a path by interpolation of the corrections of the graph nodes.
+
+    Return the corrected path, and ``solution`` unchanged.
+    """
     solved_poses = solution.poses
     node_corrections = (
         Rotation.from_quat(solved_poses[:, 3:]) * Rotation.from_quat(graph_poses[:, 3:]).inv()

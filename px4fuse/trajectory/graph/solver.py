@@ -1,5 +1,6 @@
 """Pose graph optimisation by Levenberg-Marquardt, with robust rejection of false loop closures."""
 
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
@@ -34,8 +35,6 @@ _DAMPING_FACTOR = 10.0
 _MAX_DAMPING = 1e5
 # Minimum ratio of actual to predicted cost decrease of an accepted step, as in GTSAM
 _MIN_COST_DECREASE_RATIO = 1e-3
-# A smaller predicted decrease of the cost, relative to the cost, is a rounding error
-_MIN_RELATIVE_COST_DECREASE = 1e-13
 # Relative and absolute tolerance of the cost of a pose graph
 _COST_TOLERANCE = 1e-10
 # Relative tolerance of the cost in intermediate stages of graduated non-convexity
@@ -105,7 +104,7 @@ def solve(
     Raises
     ------
     TrajectoryError
-        The graph has no edges, is not connected, or contains a number that is not finite.
+        The edges do not connect all poses, or the graph contains a number that is not finite.
     """
     model.require_connected(graph, np.ones(len(graph.first_nodes), bool), "the edges")
     can_be_false_closure = ~graph.find_successive_edges() if is_closure is None else is_closure
@@ -168,7 +167,7 @@ def _minimise(
                 cost_decrease = cost - float(np.sum(0.5 * weights * trial_residuals.chi2))
                 is_converged = abs(cost_decrease) < relative_cost_tolerance * cost
             is_accepted = (
-                predicted_decrease > _MIN_RELATIVE_COST_DECREASE * cost
+                predicted_decrease > sys.float_info.epsilon * cost
                 and cost_decrease > _MIN_COST_DECREASE_RATIO * predicted_decrease
             )
             if is_accepted or is_converged or damping >= _MAX_DAMPING:
