@@ -128,8 +128,11 @@ pages = list(draw_pages(None, None))
 assert "Wind page" in repr(pages[0].blocks)
 """,
     "filter": """
+from artificial_batch import artificial_logs
 from comparisons import compare
 from flights import aisle_flight, unexplained
+from px4fuse.batch.run import BatchResult
+from px4fuse.batch.terminal import format_summary
 from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
@@ -143,6 +146,8 @@ for draw_pages in (flight.draw_pages, flight.draw_innovations, consistency.draw_
     assert "KF2" in repr(pages[0].blocks)
 assert analysis.main.filters["kf2"].nis_mean < analysis.main.filters["kf"].nis_mean
 assert analysis.horizontal.keys() == {"kf", "ekf2", "kf2"}
+logs = artificial_logs(20).fillna({"axis": "", "change": ""})
+assert "KF2 ◆" in repr(format_summary(BatchResult(logs, 0, frozenset(), ())).blocks)
 """,
     "command": """
 import sys

@@ -51,7 +51,10 @@ FLIGHTS = {
           {"flown_m": about(0.02), "estimate_m": about(0.098), "factor": about(4.9)},
           ("EKF2_EVP_NOISE to 0.098 m",))),
         ("gate", "54.9"),
-        reruns=(("EKF2 (replay)", (about(0.22), about(0.071)), (about(4.8), about(1.0))),),
+        reruns=(
+            ("EKF2 (replay), EKF2_EVP_NOISE 0.098", (about(0.22), about(0.071)),
+             (about(4.8), about(1.0))),
+        ),
         console=("param set EKF2_EVP_NOISE 0.098",),
     ),
     # outliers are rejected by the gate; EKF2 did not fuse for 15 s
@@ -68,9 +71,11 @@ FLIGHTS = {
         offset_s=-0.25,
         # correct timestamps at the sender or set the delay: either corrects the error
         reruns=(
-            ("KF", (about(0.24), about(0.070)), (about(0.99), about(0.93))),
-            ("EKF2 (replay), parameters", (about(0.33), about(0.080)), (about(1.22), about(0.95))),
-            ("EKF2 (replay), sender", (about(0.33), about(0.074)), (about(1.22), about(0.95))),
+            ("KF, corrected time offset", (about(0.24), about(0.070)), (about(0.99), about(0.93))),
+            ("EKF2 (replay), EKF2_EV_DELAY 264, EKF2_DELAY_MAX 300", (about(0.33), about(0.080)),
+             (about(1.22), about(0.95))),
+            ("EKF2 (replay), corrected time offset", (about(0.33), about(0.074)),
+             (about(1.22), about(0.95))),
         ),
         console=("param set EKF2_EV_DELAY 264", "param set EKF2_DELAY_MAX 300", "reboot"),
     ),
@@ -79,7 +84,8 @@ FLIGHTS = {
           ("EKF2_EV_DELAY to 0 ms",)),),
         ("timestamps and delay", "175 ms", "EKF2_EV_DELAY"),
         ("timestamps and delay",), 0.0,
-        (("EKF2 (replay)", (about(0.14), about(0.063)), (about(1.01), about(0.96))),),
+        (("EKF2 (replay), EKF2_EV_DELAY 0", (about(0.14), about(0.063)),
+          (about(1.01), about(0.96))),),
         ("param set EKF2_EV_DELAY 0", "reboot"),
     ),
     "v1.16.1_aisle_hwlog": Flown(

@@ -32,11 +32,11 @@ from px4fuse.report.card_html import SIGMA_RATIO_AXIS
 from px4fuse.report.card_text import SEVERITY_SIGNS, SYMBOL_BY_REFERENCE, format_consistent_ratios
 
 # Columns of σ ratios from innovations (source) and from errors against ground truth (truth)
-SIGMA_RATIO_COLUMNS = tuple(
-    f"{filter_name}_{reference}"
-    for filter_name in FILTER_NAMES
-    for reference in SYMBOL_BY_REFERENCE
-)
+SIGMA_RATIO_LABELS = {
+    f"{filter_name}_{reference}": f"{filter_label} {symbol}"
+    for filter_name, filter_label in FILTER_NAMES.items()
+    for reference, symbol in SYMBOL_BY_REFERENCE.items()
+}
 SEVERITIES = list(SEVERITY_SIGNS)
 FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))
 # Table columns with one value per axis
@@ -92,11 +92,7 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
             Column("Sign", "rank"),
             Column("Log", "name"),
             Column("Diagnosis and first action", "full"),
-            *(
-                Column(f"{filter_label} {symbol}", "ratio", is_on_phones=False)
-                for filter_label in FILTER_NAMES.values()
-                for symbol in SYMBOL_BY_REFERENCE.values()
-            ),
+            *(Column(label, "ratio", is_on_phones=False) for label in SIGMA_RATIO_LABELS.values()),
             Column("KF − EKF2 (m)", "number", is_on_phones=False),
             *(
                 Column(label, "line", OPTIONAL_COLUMN_GROUP)
@@ -126,7 +122,7 @@ def _make_log_cells(log: LogSummary) -> tuple[Cell, ...]:
         *(
             _make_ratio_cell(log.get(f"{name}_ratio"), name, verdict)
             # a log without results has no verdicts
-            for name, verdict in zip_longest(SIGMA_RATIO_COLUMNS, log["verdicts"], fillvalue="")
+            for name, verdict in zip_longest(SIGMA_RATIO_LABELS, log["verdicts"], fillvalue="")
         ),
         frame.make_number_cell(log.get("difference_rms_m"), format_metres),
         Cell(log.get("date", "")[:10]),
@@ -156,7 +152,7 @@ def sort_logs(logs: Iterable[LogSummary]) -> list[LogSummary]:
     """Sort logs by severity, then |ln(σ ratio)|, then position RMSE, largest first."""
 
     def compute_sort_key(log: LogSummary) -> tuple[float, ...]:
-        ratios = [log[key] for name in SIGMA_RATIO_COLUMNS if log.get(key := f"{name}_ratio")]
+        ratios = [log[key] for name in SIGMA_RATIO_LABELS if log.get(key := f"{name}_ratio")]
         largest_log_ratio = max((abs(math.log(ratio)) for ratio in ratios), default=0.0)
         return (
             SEVERITIES.index(log["severity"]),

@@ -22,7 +22,8 @@ STATUS_DONE, STATUS_NOT_COMPARED, STATUS_FAILED = "done", "not compared", "faile
 FINDING_SEPARATOR = ";"
 
 
-# Rows of columns.csv; FILTER is replaced by each filter name, so rows without FILTER are repeated
+# Rows of columns.csv. Rows with FILTER are repeated for each filter name. The repetition of the
+# other rows has no effect, because the dictionaries below contain each column once
 _COLUMN_DEFINITIONS = [
     {key: text.replace("FILTER", name) for key, text in row.items()}
     for _, rows in groupby(

@@ -1,7 +1,7 @@
 """Terminal output of ``px4fuse batch`` and ``px4fuse diff``."""
 
 from px4fuse.batch.changes import MAX_OMITTED_DIFFERENCE, MAX_OMITTED_RELATIVE_DIFFERENCE
-from px4fuse.batch.page import SIGMA_RATIO_COLUMNS, LogSummary, sort_logs, summarise_logs
+from px4fuse.batch.page import SIGMA_RATIO_LABELS, LogSummary, sort_logs, summarise_logs
 from px4fuse.batch.rows import STATUS_FAILED
 from px4fuse.batch.run import BatchResult
 from px4fuse.core.text import format_count, format_number, format_ratio
@@ -37,9 +37,9 @@ def format_summary(batch_result: BatchResult) -> Page:
     if sorted_logs:
         rows = [_make_log_row(log) for log in sorted_logs[:MAX_LISTED_LOGS]]
         page.add_table(
-            ("", "log", "diagnosis", "", "", "", ""),
+            ("", "log", "diagnosis", *[""] * len(SIGMA_RATIO_LABELS)),
             rows,
-            right_aligned_columns=(3, 4, 5, 6),
+            right_aligned_columns=range(3, 3 + len(SIGMA_RATIO_LABELS)),
         )
         page.write_muted_text(RATIO_NOTE)
     if len(sorted_logs) > MAX_LISTED_LOGS:
@@ -56,14 +56,14 @@ def format_summary(batch_result: BatchResult) -> Page:
 
 def _make_log_row(log: LogSummary) -> tuple[Cell, ...]:
     colour = SEVERITY_COLOURS.get(log["severity"], MUTED_COLOUR)
-    ratios = [log.get(f"{name}_ratio") for name in SIGMA_RATIO_COLUMNS]
+    ratio_by_label = {label: log.get(f"{name}_ratio") for name, label in SIGMA_RATIO_LABELS.items()}
     return (
         (SEVERITY_SIGNS[log["severity"]][0], colour),
         log["name"],
         log["headline"],
         *(
             f"{label} {'–' if ratio is None else format_ratio(ratio)}"
-            for label, ratio in zip(("KF ●", "◆", "EKF2 ●", "◆"), ratios, strict=True)
+            for label, ratio in ratio_by_label.items()
         ),
     )
 

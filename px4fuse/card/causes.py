@@ -42,6 +42,12 @@ REBOOT_PARAMETER_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
 MIN_REJECTED_FRACTION_TO_SHOW = 0.005
 # Filters whose settings the user can change
 TARGET_BY_ADJUSTABLE_FILTER: Mapping[FilterName, ActionTarget] = {"kf": "KF", "ekf2": "EKF2"}
+# Label of a re-run with corrected data, by kind of change
+CORRECTION_TEXTS = {
+    "time offset": "corrected time offset",
+    "rotation": "corrected rotation",
+    "bias": "corrected accelerometer bias",
+}
 # Device or filter that the user must change, by group of the finding
 ACTION_TARGET_BY_GROUP: Mapping[str, ActionTarget] = {
     "position source": "sender",
@@ -358,12 +364,12 @@ def _make_card_rerun(rerun: Rerun) -> CardRerun:
 
 
 def _format_rerun_label(rerun: Rerun) -> str:
-    kind = rerun.kinds[0]
+    (kind,) = rerun.kinds
     label = TARGET_BY_ADJUSTABLE_FILTER[rerun.filter] + " (replay)" * (rerun.filter == "ekf2")
     if OUTLIERS_KEY in rerun.change:
         return f"{label} without {rerun.change[OUTLIERS_KEY]:.0f} outliers"
-    if kind == "time offset":
-        return f"{label}, corrected time offset"
+    if kind in CORRECTION_TEXTS:
+        return f"{label}, {CORRECTION_TEXTS[kind]}"
     prefix = "default " if kind == "defaults" else ""
     change_texts = [
         f"{prefix}{COMPARISON_OPTIONS.get(name, name)} {value:g}"

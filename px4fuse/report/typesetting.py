@@ -10,6 +10,7 @@ from typing import Any
 import typst
 
 from px4fuse.report import fonts
+from px4fuse.report.card_text import PLACE_TEXTS
 from px4fuse.report.page import Page, to_typst_data
 from px4fuse.report.style import FILTER_COLOURS
 
@@ -45,6 +46,12 @@ def read_template() -> str:
 @contextmanager
 def _open_compiler(report: Mapping[str, Any]) -> Iterator[typst.Compiler]:
     font_names = fonts.find_font_names(json.dumps(report, ensure_ascii=False))
+    data = {
+        **report,
+        "fonts": font_names,
+        "filter_colours": FILTER_COLOURS,
+        "place_texts": PLACE_TEXTS,
+    }
     with TemporaryDirectory() as empty_folder:
         yield typst.Compiler(
             input=read_template().encode(),
@@ -56,9 +63,5 @@ def _open_compiler(report: Mapping[str, Any]) -> Iterator[typst.Compiler]:
             ),
             package_path=empty_folder,
             package_cache_path=empty_folder,
-            sys_inputs={
-                "data": json.dumps(
-                    {**report, "fonts": font_names, "filter_colours": FILTER_COLOURS}
-                )
-            },
+            sys_inputs={"data": json.dumps(data)},
         )
