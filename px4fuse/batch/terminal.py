@@ -4,6 +4,7 @@ from px4fuse.batch.changes import MAX_OMITTED_DIFFERENCE, MAX_OMITTED_RELATIVE_D
 from px4fuse.batch.page import SIGMA_RATIO_COLUMNS, LogSummary, sort_logs, summarise_logs
 from px4fuse.batch.rows import STATUS_FAILED
 from px4fuse.batch.run import BatchResult
+from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import format_count, format_number, format_ratio
 from px4fuse.report.card_text import SEVERITY_SIGNS
 from px4fuse.report.page import Cell, Page, styled_text
@@ -13,6 +14,8 @@ from px4fuse.results.contract import ChangeResults, ConfidenceInterval
 MAX_LISTED_REASONS = 8
 MAX_LISTED_LOGS = 40
 RATIO_NOTE = "Ratio of actual to reported σ: ● innovation ÷ √S, ◆ error ÷ σ (ground truth)"
+# Labels of SIGMA_RATIO_COLUMNS
+RATIO_LABELS = [label for name in FILTER_NAMES.values() for label in (f"{name} ●", "◆")]
 ERROR_COLOUR, WARNING_COLOUR = SEVERITY_COLOURS["error"], SEVERITY_COLOURS["warning"]
 NUMBER_TABLE_TITLES = ("number", "A", "95 %", "B", "95 %", "unit")
 
@@ -36,11 +39,8 @@ def format_summary(batch_result: BatchResult) -> Page:
     sorted_logs = sort_logs(summarise_logs(batch_result.table))
     if sorted_logs:
         rows = [_make_log_row(log) for log in sorted_logs[:MAX_LISTED_LOGS]]
-        page.add_table(
-            ("", "log", "diagnosis", "", "", "", ""),
-            rows,
-            right_aligned_columns=(3, 4, 5, 6),
-        )
+        titles = ("", "log", "diagnosis", *[""] * len(RATIO_LABELS))
+        page.add_table(titles, rows, right_aligned_columns=range(3, len(titles)))
         page.write_muted_text(RATIO_NOTE)
     if len(sorted_logs) > MAX_LISTED_LOGS:
         page.write(f"fleet.html lists {len(sorted_logs) - MAX_LISTED_LOGS} more logs.")
@@ -48,7 +48,7 @@ def format_summary(batch_result: BatchResult) -> Page:
     counts_text = ", ".join(f"{count} {status}" for status, count in counts.items())
     retry_note = " Run the same command to repeat failed logs." if STATUS_FAILED in counts else ""
     page.write(
-        f"{len(logs)} logs: {counts_text}. Results from an earlier run: "
+        f"{format_count(len(logs), 'log')}: {counts_text}. Results from an earlier run: "
         f"{format_count(batch_result.reused_count, 'log')}.{retry_note}"
     )
     return page
@@ -63,7 +63,7 @@ def _make_log_row(log: LogSummary) -> tuple[Cell, ...]:
         log["headline"],
         *(
             f"{label} {'–' if ratio is None else format_ratio(ratio)}"
-            for label, ratio in zip(("KF ●", "◆", "EKF2 ●", "◆"), ratios, strict=True)
+            for label, ratio in zip(RATIO_LABELS, ratios, strict=True)
         ),
     )
 
