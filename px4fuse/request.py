@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, Self
 
 import msgspec
 
-from px4fuse.core.text import replace_unencodable
+from px4fuse.core.text import UNIT_BY_SUFFIX, replace_unencodable
 
 AUTO: Literal["auto"] = "auto"
 # Default settings of KF: process noise, measurement noise and prediction interval
@@ -229,10 +229,6 @@ class EvaluationRequest(_BaseRequest, frozen=True, kw_only=True):
 
 
 Request = ComparisonRequest | LoopRequest | WhatIfRequest
-
-
-# Unit of a field of a request, by the suffix of its name
-UNIT_BY_SUFFIX = {"_m_s2": "m/s²", "_m": "m", "_s": "s", "_deg": "°"}
 
 
 def _make_option_names(

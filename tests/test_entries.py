@@ -387,7 +387,8 @@ def test_due_time_without_time_zone_uses_local_time_zone(monkeypatch) -> None:
 @pytest.mark.parametrize(
     ("read", "said", "texts"),
     [(parse_due_time, "--due", ("", "tomorrow", "20.11.2026", "2026-11-20 23:59 Mars/Base", "Z")),
-     (parse_late_rule, "--late", ("", "10", "10%", "-1%/day", "110%/day", "10%/week", "x%/day"))],
+     (parse_late_rule, "--late", ("", "10", "10%", "-1%/day", "110%/day", "10%/week", "x%/day",
+                                 "1 0%/day"))],
 )  # fmt: skip
 def test_invalid_due_time_or_late_rule_raises_one_line_error(read, said, texts) -> None:
     for text in texts:

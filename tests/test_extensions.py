@@ -128,15 +128,18 @@ pages = list(draw_pages(None, None))
 assert "Wind page" in repr(pages[0].blocks)
 """,
     "filter": """
-from artificial_batch import artificial_logs
 from comparisons import compare
 from flights import aisle_flight, unexplained
+from px4fuse.batch.page import format_html
+from px4fuse.batch.rows import make_axis_rows, make_table
 from px4fuse.batch.run import BatchResult
 from px4fuse.batch.terminal import format_summary
 from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
 from px4fuse.report import consistency, flight
+from px4fuse.request import ComparisonRequest
+from px4fuse.results.build import make_comparison_results
 analysis = unexplained(compare(aisle_flight(), Settings(sigma_z_m=0.01)))
 verdicts = make_sigma_verdicts(analysis.main)
 assert [each.word for each in verdicts if each.filter == "kf2"] == ["overconfident"] * 2
@@ -146,8 +149,10 @@ for draw_pages in (flight.draw_pages, flight.draw_innovations, consistency.draw_
     assert "KF2" in repr(pages[0].blocks)
 assert analysis.main.filters["kf2"].nis_mean < analysis.main.filters["kf"].nis_mean
 assert analysis.horizontal.keys() == {"kf", "ekf2", "kf2"}
-logs = artificial_logs(20).fillna({"axis": "", "change": ""})
-assert "KF2 ◆" in repr(format_summary(BatchResult(logs, 0, frozenset(), ())).blocks)
+results = make_comparison_results(ComparisonRequest(log="a.ulg"), analysis)
+table = make_table({**row, "log": "a.ulg"} for row in make_axis_rows(results))
+assert '"KF2 ' in format_html(table, "", "")
+assert "'KF2 ●" in repr(format_summary(BatchResult(table, 0, frozenset(), ())).blocks)
 """,
     "command": """
 import sys

@@ -13,6 +13,7 @@ from px4fuse.results.contract import ChangeResults, ConfidenceInterval
 MAX_LISTED_REASONS = 8
 MAX_LISTED_LOGS = 40
 RATIO_NOTE = "Ratio of actual to reported σ: ● innovation ÷ √S, ◆ error ÷ σ (ground truth)"
+# Labels of SIGMA_RATIO_COLUMNS
 ERROR_COLOUR, WARNING_COLOUR = SEVERITY_COLOURS["error"], SEVERITY_COLOURS["warning"]
 NUMBER_TABLE_TITLES = ("number", "A", "95 %", "B", "95 %", "unit")
 
@@ -48,7 +49,7 @@ def format_summary(batch_result: BatchResult) -> Page:
     counts_text = ", ".join(f"{count} {status}" for status, count in counts.items())
     retry_note = " Run the same command to repeat failed logs." if STATUS_FAILED in counts else ""
     page.write(
-        f"{len(logs)} logs: {counts_text}. Results from an earlier run: "
+        f"{format_count(len(logs), 'log')}: {counts_text}. Results from an earlier run: "
         f"{format_count(batch_result.reused_count, 'log')}.{retry_note}"
     )
     return page

@@ -27,10 +27,15 @@ from px4fuse.core.reading import (
     read_text,
     split_path_and_part,
 )
-from px4fuse.core.text import UNIT_NAME_BY_SYMBOL, convert_to_unit, replace_unencodable
+from px4fuse.core.text import (
+    UNIT_BY_SUFFIX,
+    UNIT_NAME_BY_SYMBOL,
+    convert_to_unit,
+    replace_unencodable,
+)
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import SETTING_RANGES
-from px4fuse.request import AUTO, OPTION_NAMES, UNIT_BY_SUFFIX, ComparisonRequest, PositionFile
+from px4fuse.request import AUTO, OPTION_NAMES, ComparisonRequest, PositionFile
 
 if TYPE_CHECKING:
     from px4fuse.results.model import Student

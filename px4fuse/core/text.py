@@ -19,6 +19,18 @@ from px4fuse.core.record import read_toml
 _UNIT_TABLES = read_toml(__file__, dict[str, dict[str, Any]], "units.toml")
 # Full name of each unit, by its symbol
 UNIT_NAME_BY_SYMBOL: Mapping[str, str] = _UNIT_TABLES["names"]
+# Unit of a field that is an option or the size of a fault, by the suffix of the field's name
+UNIT_BY_SUFFIX = {
+    "_m_s2": "m/s²",
+    "_m_s": "m/s",
+    "_m": "m",
+    "_s": "s",
+    "_hz": "Hz",
+    "_deg": "°",
+    "_percent": "%",
+    "_ppm": "ppm",
+    "_gauss": "gauss",
+}
 # Conversion factors to the base unit of each quantity
 _UNIT_FACTORS: Mapping[str, Mapping[str, float]] = _UNIT_TABLES["typed"]
 _NUMBER_WITH_UNIT = re.compile(r"([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*(\S*)", re.IGNORECASE)

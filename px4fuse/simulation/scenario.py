@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, get_args
 
+from px4fuse.core.text import UNIT_BY_SUFFIX
 from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, Aid
 
@@ -17,19 +18,6 @@ DT_S = 0.1
 # Duration (s) of acceleration and braking along the aisle
 SPEED_RAMP_DURATION_S = 1.5
 CORNER_DURATION_S = 2.0
-# Units by the last part of a field name
-UNIT_BY_SUFFIX = {
-    "_m_s2": "m/s²",
-    "_m_s": "m/s",
-    "_m": "m",
-    "_s": "s",
-    "_hz": "Hz",
-    "_deg": "°",
-    "_percent": "%",
-    "_ppm": "ppm",
-    "_gauss": "gauss",
-    "": "",
-}
 # Default values that depend on the kind of flight
 DEFAULTS_BY_KIND: Mapping[ScenarioKind, Mapping[str, float]] = {
     "aisle": {},
@@ -40,10 +28,10 @@ DEFAULTS_BY_KIND: Mapping[ScenarioKind, Mapping[str, float]] = {
 
 @dataclass(frozen=True)
 class Bounds:
-    """Limits and unit of a number on the command line.
+    """Limits, unit and option of a number on the command line.
 
     ``help_or_placeholder`` is the help of an option, or a placeholder (SECONDS) for a value of a
-    fault.
+    fault. :func:`collect_field_bounds` sets ``unit`` and ``option``.
     """
 
     low: float
@@ -73,9 +61,10 @@ def collect_field_bounds(dataclass_type: type) -> dict[str, Bounds]:
     for dataclass_field in fields(dataclass_type):
         if bounds := dataclass_field.metadata.get("bounds"):
             name = dataclass_field.name
-            suffix = next(filter(name.endswith, UNIT_BY_SUFFIX))
+            suffix = next(filter(name.endswith, UNIT_BY_SUFFIX), "")
             option = f"--{name.removesuffix(suffix).replace('_', '-')}"
-            bounds_by_field[name] = replace(bounds, unit=UNIT_BY_SUFFIX[suffix], option=option)
+            unit = UNIT_BY_SUFFIX.get(suffix, "")
+            bounds_by_field[name] = replace(bounds, unit=unit, option=option)
     return bounds_by_field
 
 

@@ -59,7 +59,7 @@ SECOND_XREF_TABLE_REASON = (
 # PDF dictionary keys that are not compared, because programs that save a PDF change them
 _COMPRESSION_AND_LENGTH_KEYS = {"/Length", "/Filter"}
 _WRITER_KEYS = {"/Producer", "/CreationDate", "/ModDate"}
-_XMP_WRITER_FIELDS = re.compile(r"<(\w+:(?:Producer|\w+Date|\w+ID|when))( [^>]*)?>[^<]*</\1>")
+_XMP_WRITER_FIELDS = re.compile(r"<(\w+:(?:Producer|\w+Date|\w+ID|when))( [^<>]*)?>[^<]*</\1>")
 MAX_XMP_BYTES = 100_000
 # Typst version in the PDF; not compared, because different versions produce equal pages
 _TYPST_VERSION_PATTERN = re.compile(r"Typst \d+(\.\d+)*")

@@ -49,8 +49,8 @@ MAX_COMMENT_LENGTH = 10_000
 
 # Points and comment of the instructor, by student id and rubric item ("" for the whole report)
 OverridesByStudent = Mapping[str, Mapping[str, GradeOverride]]
-# Syntax of the option --late without blanks, for example "10%/dayupto50%"
-_LATE_RULE_PATTERN = re.compile(r"(\d+\.?\d*)%/(day|hour)(?:upto(\d+\.?\d*)%)?")
+# Syntax of the option --late, for example "10 % / day up to 50 %"
+_LATE_RULE_PATTERN = re.compile(r"(\d+\.?\d*)\s*%\s*/\s*(day|hour)(?:\s+up to\s+(\d+\.?\d*)\s*%)?")
 # English names of the months whose German names begin with other letters
 ENGLISH_MONTHS = {"mär": "mar", "mai": "may", "okt": "oct", "dez": "dec"}
 
@@ -494,7 +494,7 @@ def parse_late_rule(text: str) -> LateRule:
     SettingsError
         The text is not a late rule.
     """
-    match = _LATE_RULE_PATTERN.fullmatch("".join(text.split()))
+    match = _LATE_RULE_PATTERN.fullmatch(text.strip())
     if match is None or float(match[1]) > 100.0:
         raise SettingsError(
             f"--late {text!r} is not a deduction, such as 10%/day or 10%/day up to 50%."
