@@ -129,11 +129,14 @@ class UnfusedPositions:
         return 1.0 / self.source.compute_rate_hz()
 
     def select_samples(self, samples: pd.DataFrame, lead_time_s: float = 0.0) -> pd.DataFrame:
-        """Return the samples from ``lead_time_s`` (s) before the unfused time span to its end."""
+        """Return the samples in the time span without fusion, and in ``lead_time_s`` (s) before."""
         return samples.loc[self.unfused_span_s[0] - lead_time_s : self.unfused_span_s[1]]
 
     def compute_status_bit_fraction(self, field_name: str, bit: int = 0) -> float:
-        """Return the fraction of the unfused time with a set status bit; NaN if not logged."""
+        """Return the fraction of the time without fusion in which a status bit is set.
+
+        Return NaN if the status field is not logged.
+        """
         state_changes = self.ekf2.status_flags.get(field_name)
         if state_changes is None:
             return float("nan")

@@ -108,7 +108,8 @@ class SensorSamples:
     step_indices : ndarray of int, shape (m,)
         Prediction step that fuses each mean.
     value : ndarray, shape (m, k)
-        Magnetic field (gauss, FRD), or velocity forward and right (m/s) minus IMU velocity.
+        Magnetic field (gauss, FRD), or velocity forward and right (m/s) from optical flow, minus
+        the velocity change since the start of the segment from the IMU.
     ned_to_body_rotation : ndarray, shape (m, k, 3)
         Mean rotation from NED to the body axes.
     sample_count : ndarray, shape (m,)
@@ -242,27 +243,31 @@ def group_samples_by_event(
     axes: slice,
     *quantities: Array,
 ) -> Array:
-    """Group position samples by event: each event fuses the samples since the previous event.
+    """Group position samples by the fusion event of the replay that uses them.
+
+    Each event fuses the samples since the previous event. Samples after the last event are omitted.
 
     Parameters
     ----------
     segment : ReplaySegment
     event_steps : ndarray of int, shape (events,)
-        Prediction step of each event.
+        Prediction step in which each event occurs, increasing.
     measurement_step_indices : ndarray of int, shape (m,)
-        Prediction step of each sample, increasing.
+        Prediction step in which each sample was measured, increasing.
     position_m : ndarray, shape (m, a)
-        Position along ``axes``.
+        Measured positions along ``axes``.
     axes : slice
-        Axes within NED.
+        Indices of the measured axes in NED; a is their number.
     *quantities : ndarray, shape (m,)
-        Further quantities of each sample.
+        Further quantities of each sample, for example its variance.
 
     Returns
     -------
     ndarray, shape (a + 2 + len(quantities), k, events)
-        Up to k samples per event. Rows: position propagated to the event with the IMU, age (s),
-        further quantities, and 1 for a sample (0 for padding).
+        Samples of each event. k is the largest number of samples in one event; other events are
+        padded with zeros. First dimension: position (m) along the a axes; age of the sample at the
+        event (s); further quantities; 1 for a sample, 0 for padding. The positions are corrected
+        with the IMU, so that each measures position - age · velocity at the event.
     """
     event_indices = np.searchsorted(event_steps, measurement_step_indices)
     # Samples after the last event are not used
@@ -323,7 +328,11 @@ def make_update_table(
 
 
 def stack_samples(samples_by_filter: Sequence[Array]) -> Array:
-    """Stack the samples of all filters along the last axis, with zeros up to equal numbers k."""
+    """Stack the samples of all filters along a new last axis.
+
+    The second axis of each array contains the samples of one event. Shorter arrays are padded with
+    zeros to the largest number of samples.
+    """
     max_samples_per_event = max(samples.shape[1] for samples in samples_by_filter)
     return np.stack(
         [
@@ -602,9 +611,11 @@ def _make_segment(
 
 
 def _find_magnetometer_3d_fusion_span(fusion_record: FusionRecord) -> Span:
-    """Return start and end (s) of EKF2's fusion of all three magnetometer axes.
+    """Return start and end (s) of the time in which the replay can fuse all magnetometer axes.
 
-    Both are infinite if EKF2 interrupted this fusion, or never started it.
+    This time starts MAGNETIC_FIELD_SETTLING_S after EKF2's first fusion of all three axes, and ends
+    with the last. Both results are infinite (no such time) if EKF2 never fused all axes, if it
+    interrupted their fusion, or if the magnetometer is logged at less than MIN_MAG_LOG_HZ.
     """
     field_gauss = fusion_record.magnetic_field_gauss
     if len(field_gauss) and field_gauss["fused_3d"].any():
@@ -744,16 +755,18 @@ def compute_low_pass_weights(
     interval_s: Array,
     new_sample_weight: Array | float,
 ) -> tuple[IntArray, Array]:
-    """Return prediction step and weight of the samples in low-pass filtered means.
+    """Return prediction step and weight of each sample in m weighted means of sensor samples.
 
-    Both arrays have the shape (m, k): m means of up to k samples, newest sample first.
+    The weights are those of a first-order low-pass filter, and their sum is 1 in each mean. Both
+    arrays have the shape (m, k) for up to k samples per mean, newest sample first. The weight is 0
+    after the last sample of a mean.
 
     Parameters
     ----------
     newest_sample_times_s, sample_count, interval_s : ndarray, shape (m,)
-        Time of the newest sample, number of samples, and sample interval of each mean.
+        For each mean: time of its newest sample, number of samples, and sample interval.
     new_sample_weight : float or ndarray, shape (m,)
-        Weight of a new sample in the low-pass filter.
+        Weight of the newest sample in one update of the low-pass filter.
     """
     # Age of each sample in sample intervals; the newest sample has age 0
     age_in_samples = np.arange(int(sample_count.max(initial=1.0)))

@@ -64,7 +64,7 @@ PROPERTY_BY_ADDITIONAL_AID = {FLOW.name: FLOW_PROPERTY, EV_POS.name: VISION_PROP
 
 
 class PropertyReplacement(Record, kw_only=True):
-    """Effect of replacing one property of KF, such as the measurement noise, by EKF2's.
+    """Effect of replacing one property of KF, such as the measurement noise, by that of EKF2.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class PropertyReplacement(Record, kw_only=True):
     position_moved_m, moved_at_s : float
         Largest change of the position by the replacement, and its time.
     position_rmse_to_truth_m : float or None
-        Position RMSE after the replacement.
+        Position RMSE against ground truth after the replacement.
     """
 
     name: str
@@ -102,7 +102,10 @@ class RejectionRun(Record, kw_only=True):
 
 
 class DifferenceOutsideReplay(Record):
-    """Largest position difference KF - EKF2 at times without an EKF2 replay, and its time."""
+    """Largest position difference KF - EKF2 in the parts of the flight that are not replayed.
+
+    ``at_s`` is the time of this difference. The EKF2 replay does not cover the whole flight.
+    """
 
     maximum_m: NotNegative
     at_s: float
@@ -111,7 +114,9 @@ class DifferenceOutsideReplay(Record):
 class DifferenceExplanation(Record, kw_only=True):
     """Explanation of the mean square difference KF - EKF2 along one axis.
 
-    The mean square is the sum of the reductions in ``steps``, plus an unexplained remainder.
+    One property of KF after another, such as the measurement noise, is replaced by that of EKF2.
+    Each replacement reduces (or increases) the mean square difference from the logged EKF2. The sum
+    of all reductions and the unexplained remainder is the mean square difference KF - EKF2.
 
     Attributes
     ----------
@@ -120,15 +125,15 @@ class DifferenceExplanation(Record, kw_only=True):
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
         Mean square difference between KF and the logged EKF2.
     steps : tuple of PropertyReplacement
-        Replacements that change KF into EKF2.
+        Replaced properties, with the reduction of the mean square difference by each of them.
     unexplained_mean_square_m2, unexplained_velocity_mean_square_m2_s2 : float
-        Mean square difference after all replacements.
+        Mean square difference from the logged EKF2 after all replacements.
     outside : DifferenceOutsideReplay or None
-        Difference at times without an EKF2 replay.
+        Largest difference KF - EKF2 in the parts of the flight that are not replayed.
     corrected : mapping from field of Settings to value
-        Corrected settings of KF.
+        Estimated noises that replace the noise settings of KF in this analysis; else empty.
     sentences : tuple of str
-        Explanations, largest contribution first.
+        Explanations for the user, largest contribution first.
     times_s, kf_minus_ekf2_m, unexplained_difference_m : ndarray
         EKF2 sample times, and position differences before and after all replacements.
     """
@@ -158,7 +163,10 @@ class DifferenceExplanation(Record, kw_only=True):
 def explain_difference_by_replacements(
     model: Ekf2Model, settings: Settings, kf_runs: Mapping[str, KfRun]
 ) -> dict[str, DifferenceExplanation] | Unavailable:
-    """Explain the difference KF - EKF2 along each axis by replacing properties of KF.
+    """Explain the difference KF - EKF2 along each horizontal axis.
+
+    One property of KF after another, such as the measurement noise, is replaced by that of EKF2.
+    The explanation consists of the change of the difference by each replacement.
 
     Parameters
     ----------
@@ -243,10 +251,11 @@ def _explain_difference_along_axis(
     spans_s: Spans,
     longest_rejection: RejectionRun | None,
 ) -> DifferenceExplanation:
-    """Divide the mean square difference KF - EKF2 along one axis among k replaced properties.
+    """Divide the mean square difference KF - EKF2 along one axis among k properties.
 
-    ``states_by_track``, shape (k + 2, 2, n), contains position and velocity at n times. The
-    first track is KF, the last track is the logged EKF2.
+    ``states_by_track``, shape (k + 2, 2, n), contains position and velocity of k + 2 tracks at n
+    times. The first track is KF. In each of the next k tracks, one more property of KF is replaced
+    by that of EKF2. The last track is the logged EKF2.
     """
     differences_by_track = states_by_track - states_by_track[-1]
     rmse_by_track = [
@@ -296,9 +305,11 @@ def _explain_difference_along_axis(
 def make_replacement_configurations(
     inputs: ReplayInputs, kf_settings: Settings
 ) -> dict[str, FilterConfiguration]:
-    """Return the filter configurations that change KF into EKF2.
+    """Return filter configurations for replays that change step by step from KF to EKF2.
 
-    Each configuration replaces one more property of KF, whose name is the key.
+    The first configuration is KF with the sample times and time steps of EKF2. Each further
+    configuration replaces one more property of KF by that of EKF2. The keys are the names of the
+    replaced properties.
     """
     logged_settings = inputs.settings
     aid = inputs.aid

@@ -124,7 +124,7 @@ class Ekf2Statistics(Record, kw_only=True, omit_defaults=False):
     changed : mapping
         Changed parameters, by PX4 name.
     without : mapping from PX4's name of an aiding source to float
-        Time (s) from which the source is not fused.
+        Aiding sources that the replay disables, with the time (s) from which they are not fused.
     resets : int
         Number of horizontal position resets.
     heading_error_mean_deg : float or Unavailable
@@ -132,11 +132,12 @@ class Ekf2Statistics(Record, kw_only=True, omit_defaults=False):
     heights : mapping from PX4's name to AidStatistics
         Statistics of each height sensor.
     others : mapping from PX4's name to AidStatistics
-        Statistics of vision in addition to GNSS.
+        Statistics of external vision, if it is fused in addition to GNSS.
     late, lost : int
         Number of samples that were fused late, and number of samples too late to be fused.
     is_predictable : bool
-        False if the statistics depend on the rejection of single samples.
+        False if very small changes of the measured positions would change the statistics, for
+        example because EKF2 would reject other samples.
     """
 
     changed: Mapping[str, float]

@@ -141,7 +141,8 @@ def _make_imu_data(comparison: Comparison, encoder: ArrayEncoder) -> PageData | 
 def _make_axis_inputs(axis: Axis, source_track: PositionTrack, encoder: ArrayEncoder) -> PageData:
     """Return position measurements (m) and the time integral of acceleration (m/s) along an axis.
 
-    Data outside the analysed time span are included, for other time offsets.
+    Data outside the analysed time span are included: if the user of the page changes the time
+    offset, they may move into the time span.
     """
     position_m = weighted_sum(source_track.samples, Columns.POSITION, axis.direction)
     is_finite = np.isfinite(position_m)
@@ -235,7 +236,10 @@ def _make_truth_data(result: AxisComparison, encoder: ArrayEncoder) -> PageData 
 def _pack_series(
     time_s: ArrayLike, columns: Iterable[ArrayLike], encoder: ArrayEncoder
 ) -> list[dict[str, int]]:
-    """Encode times and columns that the page only draws or averages."""
+    """Encode times, and columns rounded to 6 decimals because the page only draws or averages them.
+
+    KF on the page does not use these columns.
+    """
     values = [
         encoder.add(np.asarray(column), DRAWN_VALUE_ROUNDING_STEPS_PER_UNIT) for column in columns
     ]

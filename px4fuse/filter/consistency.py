@@ -184,7 +184,7 @@ def classify_sigma_ratio(
 
 
 def compute_sigma_ratio_interval(nis_mean: float, nis_band: Limits) -> Limits:
-    """Return the 95 % interval of the σ ratio √(mean NIS)."""
+    """Return the 95 % interval of the σ ratio (actual σ ÷ reported σ), estimated as √(mean NIS)."""
     return (nis_mean / nis_band[1]) ** 0.5, (nis_mean / nis_band[0]) ** 0.5
 
 

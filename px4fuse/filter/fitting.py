@@ -298,7 +298,8 @@ class NoiseFit:
     score : NegativeLogLikelihood
         -ln p as a function of the noise parameters.
     variance_factor_of_ln_sigma_z : float
-        Increase of the variance of ln SIGMA_Z by uncertain outliers; at least 1.
+        Factor, at least 1, by which the variance of ln SIGMA_Z is larger because it is uncertain
+        which measurements are outliers.
     """
 
     noise_parameters: NoiseParameters
@@ -317,9 +318,10 @@ class NoiseFit:
 def convert_to_positions_and_increments(
     preintegrated_motion: PreintegratedMotion,
 ) -> PositionsAndIncrements:
-    """Convert the inputs of KF to the inputs of :func:`fit_constant_errors`.
+    """Convert the inputs of KF along one axis to the inputs of :func:`fit_constant_errors`.
 
-    The constant errors are those of the initial position and velocity.
+    The only constant errors are those of KF's initial position and velocity. Their prior variances
+    are KF's initial covariance.
     """
     measurement_count = len(preintegrated_motion.measurement_m)
     prior_precision = np.zeros((measurement_count + 1, 2))
@@ -489,9 +491,9 @@ def _estimate_squared_errors(
     noise_parameters: NoiseParameters,
     measurement_weights: Array,
 ) -> tuple[Array, Array]:
-    """Return the expected squared error (m²) of each measurement, and its number of axes.
+    """Return the expected squared error (m²) of each measurement, summed over its measured axes.
 
-    The squared error is summed over the measured axes.
+    Return also the number of measured axes of each measurement.
     """
     squared_errors_and_axis_counts = []
     for positions in positions_by_axis:
@@ -535,10 +537,11 @@ def compute_variance_factor_of_ln_sigma_z(
     outlier_probability: Array,
     outlier_sigma_ratio: float,
 ) -> float:
-    """Return the variance of ln SIGMA_Z, relative to its variance with known outliers.
+    """Return the factor (at least 1) by which unknown outliers increase the variance of ln SIGMA_Z.
 
-    Method: missing information (Louis 1982). ``normalised_squares`` are squared errors over
-    SIGMA_Z², summed over ``measured_axis_counts`` axes.
+    With a factor of 1, the variance is as small as if it were known which measurements are
+    outliers. Method: missing information (Louis 1982). ``normalised_squares`` contains the squared
+    error of each measurement ÷ SIGMA_Z², summed over its ``measured_axis_counts`` axes.
     """
     outlier_fraction = np.mean(outlier_probability)
     log_sigma_z_information = 2.0 * float(np.sum(measured_axis_counts))

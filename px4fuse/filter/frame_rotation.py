@@ -127,8 +127,9 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
 ) -> HeadingError | Unavailable:
     """Estimate the misalignment in yaw between the position source's frame and the attitude.
 
-    If the source has orientations, and their heading error drifts, the estimate is from them.
-    Otherwise, it is from the positions and the IMU.
+    If the yaw of the source's orientations drifts relative to the attitude, the estimate is from
+    these orientations. A constant yaw difference can be the mounting angle of the source, which is
+    unknown. Without a drift, the estimate is therefore from the positions and the IMU.
 
     Parameters
     ----------

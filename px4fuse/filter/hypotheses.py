@@ -109,7 +109,7 @@ class SystematicErrors:
     scale : Estimate
         Scale factor error of the positions relative to the IMU.
     sigma_a_m_s2 : float
-        White noise of the acceleration after the fit.
+        SIGMA_A, estimated together with these errors.
     """
 
     forward_bias_m_s2: Estimate
@@ -212,7 +212,10 @@ def fit_systematic_errors(
 def _fit_sigma_a(
     design_matrix: DesignMatrix, tested_sigmas_a: list[float], is_skipped: BoolArray
 ) -> tuple[DesignMatrix, InnovationRegression]:
-    """Return the design matrix with the most likely SIGMA_A, and its least squares fit."""
+    """Fit the regression with each tested SIGMA_A.
+
+    Return the design matrix for the most likely SIGMA_A, and the least squares fit with it.
+    """
     candidates = [replace(design_matrix, sigma_a_m_s2=sigma_a) for sigma_a in tested_sigmas_a]
     fit_candidate = cache(lambda index: candidates[index].fit(is_skipped))
     best_index = _find_minimum(lambda index: fit_candidate(index).score, len(candidates))
@@ -220,7 +223,7 @@ def _fit_sigma_a(
 
 
 def _find_minimum(compute_score: Callable[[int], float], count: int) -> int:
-    """Return the index with the lowest score: descend from the middle of a grid."""
+    """Return the grid index of the lowest score, found by descent from the middle of the grid."""
     index, best_index = -1, count // 2
     while index != best_index:
         index = best_index
@@ -478,14 +481,14 @@ class InnovationRegression:
     def compute_residual_squares(self) -> Array:
         """Return the squared residual of each measurement, summed over axes.
 
-        The residuals are normalised if they are larger than expected.
+        If the RMS of all residuals exceeds 1, which is its expected value, they are divided by it.
         """
         return np.asarray(np.sum(self.residual**2, axis=0)) / max(self.residual_rms, 1.0) ** 2
 
     def estimate(self, column: int) -> Estimate:
         """Return the estimated error of one column of the design matrix, and its σ.
 
-        σ is increased if the residuals are larger than expected.
+        σ is multiplied by the RMS of the residuals if it exceeds 1, which is its expected value.
         """
         sigma = math.sqrt(self.covariance[column, column]) * max(self.residual_rms, 1.0)
         return Estimate(float(self.coefficients[column]), sigma)
@@ -502,10 +505,11 @@ class DesignMatrix:
     time_s : ndarray, shape (m,)
         Timestamps of the measurements.
     preintegrated_inputs : PreintegratedMotion
-        Inputs of KF, one in each column. Columns of each axis: data, forward bias, right bias,
-        rotation. Last columns: slow acceleration error.
+        Inputs for which KF's innovations are computed, one in each column. For each axis: flight
+        data, then the effects of a forward bias, a right bias and a yaw rotation of size 1. Last
+        columns, equal for all axes: slow acceleration error of 1 m/s² at one knot each.
     prior_sigma : ndarray, shape (k,)
-        Prior σ of the coefficients, except those of jumps.
+        Prior σ of the estimated errors, except jumps.
     """
 
     time_s: Array
@@ -519,7 +523,10 @@ class DesignMatrix:
     def fit_with_jump(
         self, jump_time_s: float, is_skipped: BoolArray
     ) -> tuple[InnovationRegression, list[int]]:
-        """Fit one more jump; return also the index of its column for each axis."""
+        """Fit the regression with one more jump.
+
+        Return also the column index of this jump in the design matrix, for each axis.
+        """
         jump_times_s = [*self.jump_times_s, jump_time_s]
         last_column = len(self.prior_sigma) - 1
         jump_columns = [

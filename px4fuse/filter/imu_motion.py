@@ -7,8 +7,9 @@ because EKF2 corrected it with the positions to be tested.
 The constant errors are those of initial attitude, gyros, accelerometers and position scale. For
 small errors, the motion is linear in them.
 
-The derivative with respect to the scale is a smooth path through the positions. Noise of the IMU
-motion would bias the scale (errors in variables, Fuller 1987).
+The derivative of the positions with respect to their scale factor is the path itself. For this
+path, a smooth curve through the measured positions is used. The path from the IMU alone is not
+used, because its noise would bias the estimated scale (errors in variables, Fuller 1987).
 """
 
 from __future__ import annotations
@@ -82,8 +83,8 @@ class SegmentMotion:
     """Motion of one segment from the IMU, and its derivatives with respect to IMU errors.
 
     ``motion_and_imu_error_derivatives``, shape (2, 3, 10, times), contains position and velocity
-    along NED. The third dimension is the motion, then its derivatives with respect to initial
-    attitude error, gyro bias and accelerometer bias.
+    along NED. The third dimension is the motion, then its nine derivatives: with respect to initial
+    attitude error, gyro bias and accelerometer bias, along three axes each.
     """
 
     time_s: Array
@@ -92,7 +93,8 @@ class SegmentMotion:
     def interpolate(self, time_s: Array) -> tuple[Array, Array]:
         """Return position and velocity at other times, each with the shape (3, 10, ...).
 
-        The second dimension contains the motion, then its derivatives.
+        The second dimension contains the motion from the IMU, then its nine derivatives: with
+        respect to initial attitude error, gyro bias and accelerometer bias, along three axes each.
         """
         last_index = len(self.time_s) - 2
         row = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last_index)
@@ -166,7 +168,8 @@ class PositionsAndImuMotion:
     def make_positions_and_increments(self, time_offsets_s: Array) -> PositionsAndIncrements:
         """Return the positions, and for each time offset the IMU increments Δp and Δv between them.
 
-        The scale factor of the positions cannot be estimated from the result.
+        The derivatives with respect to the scale factor are zero. A fit to the result therefore
+        assumes that the scale factor of the positions is 1.
         """
         interval_s = np.diff(self.time_s)
         process_noise_per_sigma_a_squared = self.dt_s * np.stack(
@@ -255,8 +258,9 @@ class PositionsAndImuMotion:
     ) -> tuple[float, NoiseParameters]:
         """Return the most likely time offset (s), and the noises with the most likely SIGMA_A.
 
-        Both are from a coarse grid. ``sigma_a_factors`` are the tested multiples of SIGMA_A. With
-        ``estimates_scale``, the scale factor of the positions may differ from 1.
+        Each time offset of a coarse grid is tested with each SIGMA_A: that of ``noise_parameters``
+        times each of ``sigma_a_factors``. The other noises are not changed. The scale factor of the
+        positions is estimated with ``estimates_scale``, otherwise it is 1.
         """
         tested_offsets_s = np.linspace(
             -MAX_TESTED_TIME_OFFSET_S, MAX_TESTED_TIME_OFFSET_S, COARSE_OFFSET_COUNT

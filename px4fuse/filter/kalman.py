@@ -47,8 +47,8 @@ class KfRun:
     Attributes
     ----------
     steps : DataFrame, shape (n, 7)
-        State and covariance after each step, and acceleration and its variance in IMU gaps in the
-        next step.
+        State and covariance after each step; input of the next step: acceleration, and additional
+        acceleration variance if the step is in an IMU gap.
     updates : DataFrame, shape (m, 8)
         Innovation, innovation variance, gains and predicted state at each measurement.
     input_gap_s : float

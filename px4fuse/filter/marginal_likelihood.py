@@ -7,8 +7,10 @@ Given the acceleration, position and velocity at the measurements are estimated 
 The normal equations Ax = b have a banded matrix A. The likelihood equals that of KF's innovations
 (Schweppe 1965).
 
-The constants are estimated by linear regression. Its inputs are the data, and their derivatives
-with respect to each constant. The Gram matrix contains the weighted inner products of the inputs.
+The constants are estimated by linear regression of the data on the derivatives of the data with
+respect to each constant. The data and these derivatives are called inputs. The data consist of
+measured positions and IMU increments. The Gram matrix contains the inner products of all pairs of
+inputs, weighted by the inverse covariance.
 
 Symbols in shapes: m measurements, a axes, s segments, T time offsets, c constants.
 """
@@ -66,7 +68,8 @@ class PositionsAndIncrements:
     prior_sigmas_of_constant_errors : ndarray, shape (c,)
         Prior σ of the unknown constants of each segment.
     delta_position_m, delta_velocity_m_s : ndarray, shape (a, T, 1 + c, m - 1)
-        Δp and Δv in each interval, then their derivatives with respect to each constant.
+        Third dimension: Δp and Δv in each interval, then their derivatives with respect to each
+        constant. Δp does not include the motion with the velocity at the start of the interval.
     correlated_noise : (float, float) or None
         Standard deviation (m) and time constant (s) of time-correlated noise.
     """
@@ -112,8 +115,9 @@ class PositionsAndIncrements:
     ) -> tuple[PositionsAndIncrements, Array]:
         """Divide all σ by SIGMA_Z; return the result and the variance of each measurement.
 
-        The variance is 1 / weight. Measurements without weight are initial states with variance 1.
-        ``random_walk_to_sigma_z_ratio`` has the unit 1/√s.
+        The variance of a measurement is 1 / weight. ``measurement_weights`` may omit the first
+        rows of the positions, which are initial states without a measurement; their variance is 1
+        and has no effect. ``random_walk_to_sigma_z_ratio`` has the unit 1/√s.
         """
         process_noise_independent_of_sigma_a = (
             self.process_noise_independent_of_sigma_a / sigma_z_m**2
@@ -199,7 +203,8 @@ class PositionFit:
     Attributes
     ----------
     gram_matrix : ndarray, shape (segments, time offsets, 1 + c, 1 + c)
-        Inner products of the data and their derivatives, weighted by the inverse covariance.
+        Inner products of all pairs of inputs, weighted by the inverse covariance. The inputs are
+        the data, then their derivatives with respect to each constant error.
     covariance_log_determinant : float
         Log determinant of the covariance of the positions.
     degrees_of_freedom : int
@@ -227,7 +232,10 @@ class PositionFit:
         return self.gram_matrix[..., 1:, 1:] + np.diag(self.prior_sigmas_of_constant_errors**-2.0)
 
     def estimate_constant_errors_by_segment(self) -> Array:
-        """Return the estimated constant errors, shape (segments, time offsets, c)."""
+        """Return the estimates of the c constant errors (such as biases) of each segment.
+
+        The shape is (segments, time offsets, c).
+        """
         return np.asarray(
             -np.linalg.solve(
                 self.compute_constant_error_information(), self.gram_matrix[..., 1:, :1]
@@ -281,9 +289,12 @@ def fit_positions(
 ) -> PositionFit:
     """Fit constant errors (such as biases) to positions, with given SIGMA_A and variances.
 
-    The inputs of the fit are the data, and their derivatives with respect to each constant error.
-    ``measured_m``, shape (axes, 1 or time offsets, inputs, measurements), contains the positions of
-    the first inputs (default: the data). The positions of the others are zero.
+    The inputs of this regression are the data, and the derivatives of the data with respect to
+    each constant error. Each input consists of positions and IMU increments Δp and Δv. Constant
+    errors change the increments only, so the derivatives have zero positions.
+
+    By default, only the first input, the data, has positions. To give positions to the first k
+    inputs, pass them as ``measured_m``, shape (axes, 1 or time offsets, k, measurements).
     """
     if measured_m is None:
         measured_m = np.nan_to_num(positions.measurement_m.T)[:, None, None]
@@ -332,10 +343,12 @@ def fit_positions(
 
 
 def _compute_inner_products(left: Array, right: Array, segment_edges: IntArray) -> Array:
-    """Return the inner products of inputs in each segment, summed over the axes.
+    """Return the inner products of all rows of ``left`` with all rows of ``right``.
 
-    ``left`` and ``right`` have the shape (axes, ..., inputs, values). ``segment_edges`` contains
-    the index of the first value of each segment, then the end of the last segment.
+    The products are summed over the axes, separately for each segment. ``left`` and ``right`` have
+    the shape (axes, ..., rows, values), with one row for each input of the regression.
+    ``segment_edges`` contains the index of the first value of each segment, then the end of the
+    last segment.
     """
     right = np.swapaxes(right, -1, -2)
     products = [
@@ -350,8 +363,9 @@ def subtract_smooth_path(
 ) -> PositionsAndIncrements:
     """Subtract a smooth path through the positions from the positions and the IMU increments.
 
-    Smaller numbers have smaller rounding errors. With ``estimates_scale``, the path becomes the
-    derivative of the data with respect to the scale factor error.
+    The remaining numbers are small and have small rounding errors. A scale factor error changes the
+    data in proportion to the path. With ``estimates_scale``, the increments of the path therefore
+    become the derivative of the data with respect to the scale factor error.
     """
     measured_m = positions.measurement_m.copy()
     dp = positions.delta_position_m.copy()
@@ -383,9 +397,10 @@ def estimate_squared_errors(
     variance_m2: Array,
     constant_errors: Array,
 ) -> ArrayPair:
-    """Return the expected squared error (m²) of each measurement, and its number of measured axes.
+    """Return the expected squared error (m²) of each measurement, summed over its measured axes.
 
-    It is the squared distance to the smoothed position plus its variance, summed over the axes.
+    The expected value is the squared difference between measured and smoothed position, plus the
+    variance of the smoothed position. Return also the number of measured axes of each measurement.
 
     Parameters
     ----------
@@ -420,10 +435,11 @@ def compute_segment_inner_products(
     left_factor_positions_and_increments: Sequence[Array],
     right_factor_positions_m: Array,
 ) -> Array:
-    """Return inner products uᵀC⁻¹v of k pairs (u, v) of inputs, shape (segments, k).
+    """Return k inner products uᵀC⁻¹v in each segment, shape (segments, k).
 
-    C is the covariance of the positions, given the acceleration. It includes unknown constant
-    errors (such as biases).
+    Each u and each v is a series of positions with the IMU increments Δp and Δv between them. C is
+    the covariance of measured positions, given the measured acceleration. It includes unknown
+    constant errors (such as biases).
 
     Parameters
     ----------
@@ -531,9 +547,10 @@ class BandedNormalEquations:
         )
 
     def whiten_explained_part(self, measured_m: Array, *weighted_increments: Array) -> Array:
-        """Return the whitened part of each input that the states explain, shape (..., values).
+        """Return L⁻¹b for each input, shape (..., values), with Ax = b and A = LLᵀ.
 
-        Its inner products are weighted by the inverse covariance.
+        The inner product of two results is the part of the weighted inner product of two inputs
+        that the estimated states x explain.
         """
         right_hand_side = self._make_right_hand_side(measured_m, *weighted_increments)
         # LAPACK solves a triangular system with unit diagonal 30 % faster

@@ -1,12 +1,13 @@
 """Formulas of KF along one axis.
 
-State x = [position, velocity]; input a, the mean acceleration of the step::
+State x = [position, velocity]. Input a: mean acceleration of a step. dt: length of the step, at
+most DT. SIGMA_A: standard deviation of the mean acceleration over the prediction interval DT::
 
     F = [[1, dt], [0, 1]]    B = [dt²/2, dt]    H = [1, 0]    R = SIGMA_Z²
     Q(dt) = SIGMA_A² · DT · [[dt³/4, dt²/2], [dt²/2, dt]]
 
-With dt = DT, Q equals that of the course UAT 366, module 2. The velocity noise per second does not
-depend on dt.
+With dt = DT, Q equals that of the course UAT 366, module 2. The velocity variance increases by
+SIGMA_A² · DT per second, independent of the length of the steps.
 
 The functions accept floats and arrays. A covariance is a tuple of its elements 00, 01, 11.
 """

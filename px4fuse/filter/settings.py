@@ -92,7 +92,10 @@ class Settings:
             )
 
     def compute_noise_density(self, additional_variance_m2_s4: "Array") -> "Array":
-        """Return the acceleration noise density (m²/s³); the additional variance is in IMU gaps."""
+        """Return the acceleration noise density (m²/s³): (SIGMA_A² + additional variance) · DT.
+
+        The additional acceleration variance of each step is 0 outside IMU gaps.
+        """
         return (self.sigma_a_m_s2**2 + additional_variance_m2_s4) * self.dt_s
 
 

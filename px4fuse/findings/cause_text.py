@@ -80,7 +80,10 @@ def _find_used_settings(analysis: Analysis) -> Mapping[str, float]:
 
 
 def describe_part_explained_by_change(cause: Rerun, statistic: Statistic) -> str:
-    """Describe the part of a wrong mean NIS, mean NEES or difference that a change explains."""
+    """Describe the part of a deviation that disappears in a re-run with changed settings.
+
+    The deviation is a wrong mean NIS, a wrong mean NEES, or the difference KF - EKF2.
+    """
     if makes_overconfident(cause, statistic):
         return "makes σ too small"
     if statistic != "difference" and brings_inside_limits(cause, statistic):

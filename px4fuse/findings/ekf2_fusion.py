@@ -427,7 +427,10 @@ def _format_aid_label(aid: AidResult) -> str:
 
 
 def _find_shared_sensor_cause(fusion_parameter: str, kf_position_aid: str) -> str:
-    """Return SOURCE_SENSOR_CAUSE if the parameter enables the sensor of KF's positions, else ""."""
+    """Return SOURCE_SENSOR_CAUSE if one sensor measures KF's positions and another aiding source.
+
+    Both are from one sensor if the same EKF2 parameter enables their fusion. Otherwise, return "".
+    """
     return (
         SOURCE_SENSOR_CAUSE
         if kf_position_aid and AIDS[kf_position_aid].switch == fusion_parameter

@@ -19,9 +19,9 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def find_usable_loop(analysis: Analysis) -> Loop | None:
-    """Return the loop of the flight, or None if poses of the source have a wrong convention.
+    """Return the loop of the flight, or None if axes, unit or orientation of the poses are wrong.
 
-    A loop closure then deforms the path, for example if the orientation has a wrong heading.
+    With such poses, for example with a wrong heading, a loop closure would deform the path.
     """
     faults = analysis.convention_faults
     if faults.orientation or faults.has_wrong_axes or faults.has_wrong_unit or faults.is_ambiguous:

@@ -49,7 +49,10 @@ def detect(analysis: Comparison) -> Findings:
 
 
 def detect_wrong_orientation(flight: Flight, source: PositionTrack) -> Findings:
-    """Detect a wrong orientation of the position source, as :func:`detect`."""
+    """Detect a wrong convention of the orientations from a source, such as the quaternion order.
+
+    Unlike :func:`detect`, it needs no comparison of KF and EKF2, and does not check positions.
+    """
     convention = check_convention(flight, source)
     if convention is not None:
         faults = find_convention_faults(convention, flight, source.frame)

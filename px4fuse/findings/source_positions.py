@@ -226,7 +226,7 @@ def detect_jumps(analysis: Analysis) -> Findings:
 
 
 def detect_constant_coordinates(analysis: Analysis) -> Findings:
-    """Detect coordinates that never change, so that the source does not measure them."""
+    """Detect coordinates that the source does not measure: they are constant in the whole log."""
     source, parameters = analysis.source, analysis.flight.log.parameters
     coordinates = constant_coordinates(source)
     is_single_coordinate = len(coordinates) == 1
@@ -390,7 +390,11 @@ def detect_scale_error(analysis: Analysis) -> Findings:
 def make_scale_finding(
     source: PositionTrack, scale_error: float, sigma: float, reference: str, action: str
 ) -> Finding:
-    """Make the finding on a scale factor error; ``reference`` includes its accuracy."""
+    """Make the finding on a scale factor error of the positions.
+
+    ``reference`` is the data from which the scale is estimated, with the accuracy of the estimate,
+    for example "the IMU (± 2 %, 95 %)".
+    """
     return finding(
         "error" if abs(scale_error) >= MIN_SCALE_ERROR_FOR_SEVERITY_ERROR else "warning",
         "source_scale_error",

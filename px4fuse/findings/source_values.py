@@ -212,8 +212,9 @@ def _describe_replayed_effect(
 ) -> str | None:
     """Describe EKF2's position RMSE in replays without and with a change of parameters.
 
-    Both replays use positions without their rotation. Return None if the change reduces the RMSE
-    too little.
+    The measured positions are rotated by ``rotation_deg`` (clockwise from above). Both replays use
+    positions that are rotated back. Return "" if no replay or ground truth is available, and None
+    if the change reduces the RMSE too little.
     """
     ekf2_model, truth = analysis.ekf2_model, analysis.flight.truth
     if (

@@ -79,8 +79,10 @@ def expand_layouts(toml_tables: Mapping[str, Any]) -> dict[str, Layout]:
 def assign_fields_to_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Return the message field of each DataFrame column.
 
-    An empty text stands for the column names, ``q[]`` for all elements of an array, and
-    ``covariance[0,6]`` for the elements 0 and 6.
+    The keys of ``fields`` are column names, or names of lists in :class:`Columns` such as POSITION.
+    The values are the names of the fields. A number is the constant value of all columns. With an
+    empty text, each field has the name of its column. ``q[]`` means the first elements of an
+    array, one for each column, and ``covariance[0,6]`` means the elements 0 and 6.
 
     Examples
     --------
@@ -153,8 +155,8 @@ def classify_invalid_positions(samples: pd.DataFrame, columns: list[str]) -> "pd
 
     - "NaN": a coordinate is not finite.
     - "zero": the source sent 0, 0, 0 instead of a position.
-    - "far": the position is damaged.
-    - "held": the source sent its last position again.
+    - "far": the position is more than 10 km from the median position, so it must be damaged.
+    - "held": the source sent its last position again and again.
     """
     values, time_s = samples[columns].to_numpy(), samples.index.to_numpy()
     reason_by_row = pd.Series("", index=samples.index)

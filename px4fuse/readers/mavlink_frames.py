@@ -98,9 +98,10 @@ class MavlinkFrames:
         )
 
     def table(self, message: str, rows: IntArray) -> NDArray[Any]:
-        """Decode frames with one message to a structured array with its fields, in MAVLink units.
+        """Decode messages of one type to a structured array with one row per frame.
 
-        MAVLink 2 omits trailing zero bytes of the payload. They are added again.
+        The fields are in MAVLink units. ``rows`` are the indices of the frames to decode. MAVLink 2
+        omits trailing zero bytes of the payload. They are added again.
         """
         layout = wire_layout(MESSAGE_IDS[message])
         payload = np.zeros((len(rows), layout.itemsize), dtype=np.uint8)

@@ -184,7 +184,7 @@ class Recording:
         return self.frames.table(message, self.rows(message))
 
     def find_most_frequent(self, layouts: Sequence[Layout]) -> Layout:
-        """Return the layout whose message the autopilot sent most often."""
+        """Return the layout of the message type that the autopilot sent most often."""
         return max(layouts, key=lambda layout: len(self.rows(layout.topic)))
 
     def read(
@@ -274,7 +274,10 @@ class Recording:
         return np.where(is_boot_time, timestamp_s, self.compute_receipt_boot_times_s(rows))
 
     def record_stream(self, data_kind: str, *messages: str, clock: str = BOOT_CLOCK_TEXT) -> None:
-        """Store the messages and the clock of a kind of data, such as "imu", for the report."""
+        """Store the origin of a kind of data, such as "imu", for the report.
+
+        The origin is the names of the MAVLink messages, and the clock of their timestamps.
+        """
         self.data_source_by_kind[data_kind] = DataSource(messages, clock, self.frames.name)
 
 

@@ -254,10 +254,11 @@ def find_rows_of_timestamps(times_s: Array, wanted_times_s: ArrayLike) -> IntArr
 def compute_samples_per_step(
     configured_step_s: float, imu_interval_s: float, step_ends: ArrayLike = ()
 ) -> int:
-    """Return the number of IMU samples in one EKF2 prediction: the rounded ratio of both intervals.
+    """Return the number of IMU samples in one EKF2 prediction.
 
-    Near a half-integer ratio, both neighbouring counts are possible. The count that fits
-    ``step_ends`` is then used: the indices of the IMU samples at which logged predictions end.
+    It is the configured prediction interval divided by the IMU interval, rounded. Near 2.5, for
+    example, both 2 and 3 are possible. Then the number is used that agrees with ``step_ends``, the
+    indices of the IMU samples at which logged predictions end.
 
     >>> compute_samples_per_step(0.010, 0.00375), compute_samples_per_step(0.010, 0.004)
     (3, 3)
@@ -394,8 +395,9 @@ def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
     The columns are the field, EKF2's innovations if logged, and fused_3d: 1 while EKF2 fuses the
     field as a vector. The table is empty if data are missing.
 
-    A complete log has the field of each fusion; the longer one is used. Otherwise, EKF2's filtered
-    innovations give the mean field between two logged observations, so they are preferred.
+    The field is logged in vehicle_magnetometer and in estimator_aid_src_mag. The topic with more
+    samples is used. If it does not contain every fused sample, estimator_aid_src_mag is preferred:
+    its low-pass filtered innovations give the mean field between two logged samples.
     """
     magnetometer, observations = (
         topics.primary_samples(TOPIC_LAYOUTS[topic]).dropna()

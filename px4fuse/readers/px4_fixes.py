@@ -63,17 +63,18 @@ def read_unlogged_fixes(
 def reconstruct_fixes(
     fixes: pd.DataFrame, ekf2: Ekf2 | Unavailable, delay_s: float
 ) -> tuple[pd.DataFrame, str]:
-    """Reconstruct GNSS fixes that are not logged: EKF2 position plus innovation (up to v1.15).
+    """Reconstruct the GNSS fixes between logged fixes: EKF2 position plus innovation.
 
-    Return the fixes with interpolated heights, and a note for the user. Both are empty if the error
-    exceeds MAX_FIX_RECONSTRUCTION_ERROR_M.
+    Up to PX4 v1.15, the log may lack some of the fixes that EKF2 fused. Return the missing fixes,
+    with heights interpolated between logged fixes, and a note for the user. Both are empty if the
+    RMS error, measured at logged fixes, exceeds MAX_FIX_RECONSTRUCTION_ERROR_M.
 
     Parameters
     ----------
     fixes : DataFrame
-        Logged fixes (m, NED) and variances, indexed by measurement time (s).
+        Logged fixes: position (m, NED) and variances, indexed by measurement time (s).
     delay_s : float
-        Delay from measurement to timestamp that EKF2 assumes.
+        Delay (s) from measurement to timestamp of a fix that EKF2 assumes.
     """
     empty_result = pd.DataFrame(columns=fixes.columns), ""
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.horizon_s, Unavailable) or len(fixes) < 3:

@@ -135,7 +135,7 @@ def make_track(
     needed_columns : list of str
         Columns that must be finite.
     is_odometry : bool
-        True if the orientation of the source changes, so that the source is not UWB.
+        True if the source also measures its orientation: it is then visual odometry, not UWB.
     track_fields
         Other fields of :class:`~px4fuse.flight.model.PositionTrack`.
     """

@@ -101,9 +101,10 @@ class _ULogContent(io.BytesIO):
 
 
 def _read_samples(parser: ULog, content: bytes, start: int) -> int:
-    """Read successive samples from ``start``; return the offset of the next other message.
+    """Read topic samples from byte offset ``start`` up to the first message that is not a sample.
 
-    pyulog reads the other messages. It would also read samples, but in twice the time.
+    Return the offset of that message. pyulog reads all other messages. It would also read samples,
+    but in twice the time.
     """
     subscriptions, ignored_message_ids = parser._subscriptions, parser._filtered_message_ids
     last_time_us = parser._last_timestamp
@@ -275,7 +276,10 @@ class Topics:
         return rows_between(samples, -MAX_TIME_OUTSIDE_IMU_DATA_S, end_s)
 
     def read(self, *layouts: Layout) -> pd.DataFrame:
-        """Read the first topic definition whose required fields are in the log; else empty."""
+        """Read a topic with the first of several definitions whose required fields are logged.
+
+        Return an empty table if no definition fits.
+        """
         layout = self.find_layout(*layouts)
         return _empty_frame(layouts[0]) if layout is None else self.read_instance(layout)
 
@@ -302,7 +306,10 @@ class Topics:
         return joined_tables[~joined_tables.index.duplicated()]
 
     def record_stream(self, data_kind: str, *topics: str) -> None:
-        """Store the topics and the clock of a kind of data, such as "imu", for the report."""
+        """Store the origin of a kind of data, such as "imu", for the report.
+
+        The origin is the names of the topics, and the clock of their timestamps.
+        """
         # The timestamp of sensor_combined is the gyro's measurement time
         has_measurement_time = data_kind == "imu" or any(
             np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))

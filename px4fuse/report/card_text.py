@@ -83,7 +83,7 @@ class Paragraph(NamedTuple):
     ----------
     wrap_indent : str or None
         Indent of further lines and sentences; None if the paragraph is one line, such as a command.
-        An empty text has no lines if it is set.
+        With None, an empty text gives a blank line, otherwise no line.
     plot : str
         Plot on the right, omitted on a narrow terminal.
     """
@@ -194,7 +194,9 @@ def to_ascii(text: str) -> str:
 
 
 def format_consistent_ratios() -> str:
-    """Format the limits of the σ ratios of a consistent filter: innovations ●, ground truth ◆.
+    """Format the limits of the σ ratio (actual σ ÷ reported σ) of a consistent filter.
+
+    ● marks the ratio from innovations, ◆ the ratio from errors against ground truth.
 
     >>> format_consistent_ratios()
     '● 0.8 to 1.25, ◆ 0.67 to 1.5'
@@ -206,7 +208,10 @@ def format_consistent_ratios() -> str:
 
 
 def draw_sigma_ratio(ratio: float | None, reference: Reference) -> str:
-    """Draw a σ ratio as text on a logarithmic axis with the band of consistent ratios.
+    """Draw a σ ratio (actual σ ÷ reported σ) as a mark on a logarithmic axis of characters.
+
+    ● is a ratio from innovations, ◆ from errors against ground truth. ░ is the range of a
+    consistent filter. An arrow is a ratio outside the axis.
 
     >>> draw_sigma_ratio(0.93, "source")
     '1/10 ──────────────░●░░░────────────── 10'
@@ -232,7 +237,11 @@ def draw_sigma_ratio(ratio: float | None, reference: Reference) -> str:
 def locate_sigma_ratio(
     ratio: float, reference: Reference, interval: tuple[float, float] | None
 ) -> dict[str, Any]:
-    """Return the positions of a σ ratio and its intervals, as fractions of the axis length."""
+    """Return the place of a σ ratio on the axis of its plot, as a fraction of the axis length.
+
+    Return also the fractions for the range of a consistent filter, and for the 95 % interval of the
+    ratio.
+    """
     fraction = map_ratio_to_axis(ratio)
     return {
         "fraction": fraction,

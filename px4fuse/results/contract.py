@@ -76,7 +76,7 @@ class PositionSource(Record, kw_only=True):
     kind : str
         Type of sensor.
     path : str
-        Form in which the positions are available, for example "as received".
+        Origin of the positions, for example "as received" by PX4, or "rebuilt from innovations".
     ekf2_parameters : mapping
         Logged EKF2 parameters for this source, in units of PX4.
     reason : str

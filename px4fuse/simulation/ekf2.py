@@ -3,8 +3,9 @@
 The EKF2 model starts at rest and runs on the simulated IMU and positions. Its error states are
 linearised about the true attitude.
 
-Outdoors, EKF2 fuses magnetometer and barometer. Indoors, its heading and height have a simulated
-slow error. KF uses vehicle_attitude, so indoors it must not depend on EKF2 parameters.
+Outdoors, EKF2 fuses magnetometer and barometer. Indoors, heading and height are the true values
+plus a simulated slow error. KF uses vehicle_attitude. Indoors, this topic is not computed by the
+EKF2 model either, so the results of KF do not depend on EKF2 parameters.
 """
 
 from collections.abc import Mapping

@@ -140,7 +140,10 @@ def _make_local_position_topic(model_inputs: ReplayInputs, ekf2_output: Ekf2Outp
 def _make_states_topic(
     model_inputs: ReplayInputs, model_run: SegmentRun, ekf2_output: Ekf2Output
 ) -> Topic:
-    """Make estimator_states as PX4 v1.16 logs it, with horizontal positions of 0."""
+    """Make estimator_states as PX4 v1.16 logs it.
+
+    Its horizontal position is 0, because v1.16 stores latitude and longitude elsewhere.
+    """
     end_step = model_run.events[0].end_step
     logged_indices = ekf2_output.find_logged_messages(
         np.diff(end_step, prepend=0) > 0, end_step, STATES_LOG_RATE_HZ

@@ -55,7 +55,10 @@ def _sum_ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
 
 
 def _differentiate(ramp_function: PPoly, time_s: Array, orders: Sequence[int]) -> list[Array]:
-    """Return derivatives of a sum of ramps, shape (t, k) each; order -1 is the integral."""
+    """Return derivatives of a sum of ramps at given times, one array for each order.
+
+    The arrays have the shape (times, components of the ramps). Order -1 is the integral.
+    """
     clipped_times_s = np.clip(time_s, *ramp_function.x[[0, -1]])
     return [ramp_function.derivative(order)(clipped_times_s) for order in orders]
 

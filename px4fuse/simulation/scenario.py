@@ -30,8 +30,8 @@ DEFAULTS_BY_KIND: Mapping[ScenarioKind, Mapping[str, float]] = {
 class Bounds:
     """Limits, unit and option of a number on the command line.
 
-    ``help_or_placeholder`` is the help of an option, or a placeholder (SECONDS) for a value of a
-    fault. :func:`collect_field_bounds` sets ``unit`` and ``option``.
+    ``help_or_placeholder`` is the help text if the number is the value of an option. If the number
+    is the size of a simulated fault, it is the placeholder in the syntax, such as SECONDS. :func:`collect_field_bounds` sets ``unit`` and ``option``.
     """
 
     low: float
@@ -171,12 +171,15 @@ class Scenario:
 
     @property
     def aid(self) -> Aid:
-        """Aiding source as which EKF2 fuses the positions."""
+        """EKF2's aiding source for the simulated positions: GNSS outdoors, else external vision."""
         return GNSS_POS if self.kind == "outdoor" else EV_POS
 
     @property
     def accelerometer_noise_m_s2(self) -> float:
-        """White noise (m/s²) of one accelerometer sample; SIGMA_A is that of a 0.1 s mean."""
+        """White noise (m/s², 1 σ) of one accelerometer sample.
+
+        The mean of the samples in 0.1 s (DT) then has the noise SIGMA_A.
+        """
         return self.sigma_a_m_s2 * math.sqrt(DT_S * self.imu_rate_hz)
 
 

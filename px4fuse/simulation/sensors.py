@@ -484,7 +484,7 @@ def make_timestamps(time_us: IntArray, delay_us: int | IntArray = 0) -> dict[str
 
 
 def split_vectors(values: Mapping[str, Array]) -> dict[str, Any]:
-    """Split vectors, shape (n, 3), into PX4 fields, for example "v" into vx, vy and vz."""
+    """Split vectors into one PX4 field per axis: "v", shape (n, 3), becomes vx, vy and vz."""
     return {
         f"{name}{axis}": vector[:, i]
         for name, vector in values.items()

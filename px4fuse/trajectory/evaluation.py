@@ -418,7 +418,8 @@ def _choose_time_offset(
 ) -> tuple[TimeOffset, list[str], float | None]:
     """Choose the time offset to add to the timestamps of the estimate.
 
-    Also return warnings, and a better time offset (s) or None.
+    Return also warnings. If the timestamps are used as they are, but another time offset (s) fits
+    better, return also that offset, so that the caller can warn; else None.
     """
     if isinstance(given_offset_s, float | int):
         reason = "The user chose the time offset."

@@ -187,7 +187,10 @@ def _compute_grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array
 def _smooth_values(
     grid_values: Array, time_s: Array, step_s: float, derivative_order: int = 0
 ) -> Array:
-    """Smooth values on a time grid with a Gaussian filter, or return their smoothed derivative."""
+    """Smooth values on a time grid with a Gaussian filter.
+
+    With ``derivative_order`` 1, return the derivative of the smoothed values per grid step.
+    """
     from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415 - slow import
 
     smoothing_sigma_samples = max(SMOOTHING_SIGMA_S, compute_median_interval_s(time_s)) / step_s
@@ -277,7 +280,10 @@ class _OffsetFit:
         return compute_rms_length_m(self.dense_track_position_m - self.aligned_position_m)
 
     def compute_misfit(self) -> float:
-        """Return the RMS position residual divided by the RMS extent of the dense trajectory."""
+        """Return the RMS position residual, relative to the extent of the trajectory.
+
+        The extent is the RMS distance from the mean position, for the trajectory with more poses.
+        """
         # A bad fit can shrink the sparse trajectory, so its extent is not used
         extent_m = float(np.sqrt(self.dense_track_position_m.var(axis=0).sum()))
         if extent_m == 0.0:

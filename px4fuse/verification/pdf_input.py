@@ -154,9 +154,10 @@ def _check_file(pdf: bytes) -> None:
 
 
 def _estimate_inflated_bytes(pdf: bytes, start: int, limit_bytes: int) -> int:
-    """Return the size (bytes) of the decompressed zlib data at ``start``; 0 without zlib data.
+    """Estimate the size (bytes) of the zlib data at ``start`` after decompression.
 
-    The result is at least 1000 and at most ``limit_bytes`` + 1.
+    Return 0 if no zlib data start there. Otherwise, the result is at least 1000 and at most
+    ``limit_bytes`` + 1.
     """
     zlib_header = pdf[start : start + 2]
     if (

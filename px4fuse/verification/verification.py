@@ -334,7 +334,8 @@ def is_same_number_up_to_rounding(
 ) -> bool:
     """Return True if two printed numbers are the rounded values of the same result.
 
-    ``agreeing_pairs`` are values in the report and in the new analysis.
+    ``agreeing_pairs`` contains results that agree within the tolerances: each is a pair of the
+    value in the report and the value in the new analysis.
     """
     decimals = _count_decimals(submitted_number)
     printed_pair = float(submitted_number), float(redrawn_number)
@@ -355,7 +356,8 @@ def compare_results(
     mismatches : tuple of Mismatch
         Values that differ by more than the tolerances.
     is_same_number : callable
-        Returns True if two printed numbers are rounded values of one result.
+        Function of two printed numbers. It returns True if they are the rounded recorded value and
+        the rounded new value of the same result.
     value_count : int
         Number of compared values.
     """

@@ -154,7 +154,10 @@ def _compute_commutator(tangent: Array) -> Array:
 
 
 def _build_block_matrix(rotation: Array, coupling: Array, corner: Array | float) -> Array:
-    """Build the matrices [[rotation, coupling], [0, corner]], translation before rotation."""
+    """Build the block matrices [[rotation, coupling], [0, corner]].
+
+    They multiply tangent vectors that contain the translation first, then the rotation.
+    """
     d = rotation.shape[-1]
     size = d + coupling.shape[-1]
     matrix = np.zeros((*rotation.shape[:-2], size, size))

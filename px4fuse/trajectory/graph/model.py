@@ -122,7 +122,7 @@ def count_observed_directions(information: Array) -> IntArray:
 
 
 def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
-    """Scale matrices to unit diagonal, and return the square roots of the diagonals first."""
+    """Return the square roots of the diagonals, and the matrices scaled to unit diagonal."""
     scale = np.sqrt(np.clip(np.diagonal(matrices, axis1=-2, axis2=-1), 0.0, None))
     inverse_scale = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
     return scale, matrices * (inverse_scale[..., :, None] * inverse_scale[..., None, :])

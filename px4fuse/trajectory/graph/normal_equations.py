@@ -71,7 +71,7 @@ class NormalEquations:
         element_starts = np.append(0, np.cumsum(row_counts * unknowns_per_pose * column_counts))
 
         def find_rows(group: IntArray, pose_index: IntArray) -> IntArray:
-            """Return the rows of each pose in the front of ``group``, shape (n, d)."""
+            """Return the d rows of each of n poses in the frontal matrix of its ``group``."""
             row = np.searchsorted(keys_of_group_and_row, group * len(poses) + pose_index)
             return np.asarray(
                 (row - row_starts[group])[:, None] * unknowns_per_pose + offsets_in_pose
