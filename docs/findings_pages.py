@@ -245,16 +245,12 @@ def find_detector_modules() -> dict[str, str]:
             if isinstance(node, ast.Constant) and node.value in FINDING_TITLES:
                 module_by_id.setdefault(str(node.value), path.stem)
     # Modules whose finding ids are no literals, because they are composed of a name and a suffix
-    module_by_id_with_known_prefix = {
-        name: stem
-        for name in FINDING_TITLES
-        for stem, prefixes in {
-            "noises": ("sigma_", "kf_", "ekf2_over", "ekf2_under"),
-            "ekf2_settings": ("ekf2_noise_",),
-        }.items()
-        if name.startswith(prefixes)
-    }
-    return module_by_id | module_by_id_with_known_prefix
+    for name in FINDING_TITLES:
+        if name.startswith("sigma_") or name.endswith("confident"):
+            module_by_id[name] = "noises"
+        elif name.startswith("ekf2_noise_"):
+            module_by_id[name] = "ekf2_settings"
+    return module_by_id
 
 
 def is_numeric_literal(expression: ast.expr) -> bool:

@@ -37,12 +37,12 @@ from px4fuse.simulation.scenario import Scenario
 
 pytestmark = pytest.mark.usefixtures("cached_analyses")
 
-WIDTH = 96  # the widest line of the card has 95 characters
+WIDTH = 99  # the widest line of the card has 98 characters
 
 
 def commands(text: str) -> list[str]:
     """Return the printed commands, each the last part of a line."""
-    return re.findall(r"^(?:.*  )?(px4fuse .*)$", text, re.MULTILINE)
+    return re.findall(r"^(?:.*(?:  |: ))?(px4fuse .*)$", text, re.MULTILINE)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,6 @@ from px4fuse.results.contract import ChangeResults, ConfidenceInterval
 MAX_LISTED_REASONS = 8
 MAX_LISTED_LOGS = 40
 RATIO_NOTE = "Ratio of actual to reported σ: ● innovation ÷ √S, ◆ error ÷ σ (ground truth)"
-# Labels of SIGMA_RATIO_COLUMNS
 ERROR_COLOUR, WARNING_COLOUR = SEVERITY_COLOURS["error"], SEVERITY_COLOURS["warning"]
 NUMBER_TABLE_TITLES = ("number", "A", "95 %", "B", "95 %", "unit")
 
