@@ -42,7 +42,7 @@ WIDTH = 99  # the widest line of the card has 98 characters
 
 def commands(text: str) -> list[str]:
     """Return the printed commands, each the last part of a line."""
-    return re.findall(r"^(?:.*(?:  |: ))?(px4fuse .*)$", text, re.MULTILINE)
+    return re.findall(r"^(?:.*(?:  |run again: ))?(px4fuse .*)$", text, re.MULTILINE)
 
 
 @pytest.fixture(scope="module")
