@@ -55,11 +55,13 @@ class Convention(Record, kw_only=True, omit_defaults=False):
     clock_drift : float
         Rate of the sender's clock minus 1.
     scale : float
-        Ratio of displacements, source to IMU.
+        Scale factor of the positions: displacement according to the source ÷ displacement
+        according to the IMU.
     log_odds : float or None
-        Log odds of the best convention to the second best.
+        Log odds (nats) of the best convention to the second best.
     log_likelihood_gain : float
-        Log likelihood ratio to positions that do not depend on the motion.
+        Log likelihood ratio (nats, with prior odds) of this convention to a model in which the
+        positions are unrelated to the motion that the IMU measures.
     alternatives : tuple of str
         Other axes, units and delays that fit nearly as well.
     """

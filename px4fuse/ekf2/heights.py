@@ -189,7 +189,9 @@ class BadAccelerationFlag:
         return np.asarray(np.maximum(overlap_s, 0.0) / np.maximum(end_s - begin_s, 1e-9))
 
     def update(self, time_s: Array, previous_innovations: Array, innovations: Array) -> None:
-        """Update the modelled flag after a fusion of heights.
+        """Update the flag for a bad vertical acceleration after a fusion of heights.
+
+        Configurations that use the logged flag are not changed.
 
         Parameters
         ----------

@@ -122,7 +122,8 @@ class Agreement(Record, kw_only=True):
     heading_rms_difference_deg : float or None
         None if the replay uses the logged heading.
     carried_difference_m : float or None
-        Largest position difference with optical flow as the only horizontal source.
+        Largest horizontal difference between replayed and logged position in the time with optical
+        flow as the only horizontal aiding source.
     doubtful : mapping from PX4's name of an aiding source to str
         Aiding sources that do not agree with the log, and the reasons.
     good : bool
@@ -568,9 +569,18 @@ def _format_unlike_limit(value: float, limit: float) -> str:
 def judge_with_logged_rejections(
     agreement: Agreement, agreement_with_logged_rejections: Agreement
 ) -> Agreement:
-    """Return the agreement with the log for a flight with many rejections.
+    """Judge the agreement of replay and log for a flight in which EKF2 rejected many samples.
 
-    ``agreement_with_logged_rejections`` is from a replay that rejects the same samples as EKF2.
+    If replay and EKF2 reject different samples, they differ much even with a correct model.
+    Therefore a second replay rejects the same samples as EKF2. The result is the agreement of the
+    second replay, judged with wider limits, with the rejections of the first replay.
+
+    Parameters
+    ----------
+    agreement : Agreement
+        Agreement of the replay that decides itself on rejections.
+    agreement_with_logged_rejections : Agreement
+        Agreement of the replay that rejects the same samples as EKF2.
     """
     rejected_fraction = agreement.rejected_fraction_logged
     is_mostly_rejected = rejected_fraction > MOSTLY_REJECTED_FRACTION

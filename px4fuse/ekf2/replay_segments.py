@@ -190,9 +190,11 @@ class ReplaySegment:
     mean_bias_down_m_s2 : float
         Mean vertical accelerometer bias.
     internal_to_published_position_ratio : float or ndarray, shape (3,)
-        Ratio of EKF2's internal to its published position along each axis.
+        Ratio of EKF2's internal to its published position along each axis. It is not 1 since PX4
+        v1.16, which computes positions on an ellipsoid but publishes them on a sphere.
     preceding_segment : ReplaySegment or None
-        Flight before the start, from which the correlations are estimated.
+        Seconds of the flight before this segment. Their replay gives the correlations of the
+        initial state, which are not logged.
     changed_parameters : mapping from PX4's name to float
         Parameters that were changed in flight.
     """
@@ -323,7 +325,7 @@ def make_update_table(
 
 
 def stack_samples(samples_by_filter: Sequence[Array]) -> Array:
-    """Stack the samples of all filters along the last axis, with zeros up to equal numbers k."""
+    """Stack the samples of all filters along the last axis, padded with zeros to equal length k."""
     max_samples_per_event = max(samples.shape[1] for samples in samples_by_filter)
     return np.stack(
         [

@@ -174,9 +174,10 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     directions = np.array([axis.direction for axis in axes])
 
     def undo_low_pass(tau_s: float) -> tuple[PositionsAndImuMotion | Unavailable, float]:
-        """Undo a low-pass filter with time constant ``tau_s``.
+        """Compute the positions before a low-pass filter with time constant ``tau_s``.
 
-        Return the unfiltered positions with their IMU motion, and the change of -ln p.
+        Return the unfiltered positions with the IMU motion between them, and a term to add to their
+        negative log likelihood, so that the sum is that of the measured positions.
         """
         rho = np.zeros(len(time_s))
         if tau_s:
