@@ -409,7 +409,11 @@ def _format_action(action: Action) -> str:
 def _mark_explained_verdicts(
     sigma_verdicts: Sequence[Verdict], causes: Sequence[DiagnosedCause], *, may_drift: bool
 ) -> tuple[Verdict, ...]:
-    """Mark the verdicts "overconfident" and "underconfident" that no filter setting corrects."""
+    """Set ``is_explained`` in the verdicts that do not require a change of filter settings.
+
+    These are verdicts "overconfident" or "underconfident" of a filter whose settings shall be kept,
+    that is consistent against ground truth, or whose position source may drift.
+    """
     filters_to_keep_unchanged = {
         name
         for cause in causes
