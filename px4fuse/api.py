@@ -77,7 +77,8 @@ def compare(
         Time offset to add to the position timestamps. "auto" estimates it, and is the default with
         ``position``.
     axes : str or sequence of str
-        "north", "east", "down" or "aisle" (main direction of the track); default: all axes.
+        "north", "east", "down" or "aisle" (horizontal axis along the main direction of the track);
+        default: all axes.
     heading_deg : float, optional
         Heading of the axis "aisle", clockwise from north; default: main direction of the track.
     start_s, end_s : float, optional

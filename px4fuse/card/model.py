@@ -131,7 +131,8 @@ class CardRerun(Record, kw_only=True):
     from_s : float or None
         Start of the replay (s).
     position_rmse_m, source_ratio, truth_ratio, rejected_fraction : (float, float) or None
-        RMSE, σ ratios (source, ground truth) and rejected fraction, before and after the change.
+        Position RMSE, ratios of actual to reported σ (against position source and ground truth) and
+        rejected fraction, before and after the change.
     improves : str
         Quantities that the change improves.
     """

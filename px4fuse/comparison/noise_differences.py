@@ -27,6 +27,7 @@ class NoisyPart(NamedTuple):
     """Time span (s) with larger innovations than the rest of the flight.
 
     ``sigma_ratio`` is σ of the innovations in the time span ÷ σ in the rest of the flight.
+    ``sigma_ratio_without_outliers`` is computed without the detected outliers.
     """
 
     start_s: float

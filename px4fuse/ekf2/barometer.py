@@ -91,10 +91,10 @@ def _combine_barometer_samples(
 ) -> pd.Series:
     """Return the barometer heights (m, down) that EKF2 fused, by time (s).
 
-    EKF2's log message on the barometer contains only some of the fused samples. The missing heights
-    are taken from ``logged_down_m`` (barometer message), or computed from the logged updates of the
-    barometer bias. The remaining gaps are filled with random heights that agree with EKF2's logged
-    filtered innovation.
+    EKF2's logged height updates contain only some of the fused samples. Missing heights are taken
+    from ``logged_down_m`` (barometer topic), or computed from the logged updates of the barometer
+    bias. The remaining gaps are filled with random heights that agree with EKF2's logged filtered
+    innovation.
     """
     logged_barometer_updates = ekf2.aids[BAROMETER.name].samples
     if "observation_down" not in logged_barometer_updates or len(logged_barometer_updates) < 2:

@@ -118,9 +118,10 @@ class Agreement(Record, kw_only=True):
     decisions_same : float
         Fraction of samples that EKF2 and replay both rejected or both accepted.
     published_rms_difference_m : float
-        RMS difference of the published horizontal position.
+        RMS difference between replayed and logged horizontal position, as published.
     heading_rms_difference_deg : float or None
-        None if the replay uses the logged heading.
+        RMS difference between replayed and logged heading; None if the replay uses the logged
+        heading.
     carried_difference_m : float or None
         Largest horizontal difference between replayed and logged position in the time with optical
         flow as the only horizontal aiding source.

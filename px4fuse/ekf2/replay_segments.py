@@ -116,7 +116,7 @@ class SensorSamples:
     noise : ndarray, shape (m,)
         R of one sample; 0 if an EKF2 parameter determines R.
     gate : float
-        Innovation gate in √S; infinite if an EKF2 parameter determines the gate.
+        Maximum accepted |innovation| ÷ √S; infinite if an EKF2 parameter determines the gate.
     state_slices : tuple of slice
         State indices of the measured vector (NED) and of the sensor bias (body frame).
     """
@@ -161,7 +161,8 @@ class HeightSamples:
 class ReplaySegment:
     """Part of a flight without gaps, with n prediction steps of EKF2.
 
-    The nominal attitude is EKF2's published attitude. Vectors are in NED by default.
+    The nominal attitude is the attitude that EKF2 published in the log. Vectors are in NED by
+    default.
 
     Attributes
     ----------

@@ -89,7 +89,7 @@ class SourceLowPass:
     lag_s : float
         Lag of the positions at constant velocity.
     gain_nats : float
-        Log-likelihood gain of the low-pass filter over white noise.
+        Log likelihood (nats) with the low-pass filter minus log likelihood with white noise.
     sigma_z_m : float
         White position noise before the low-pass filter (1 σ).
     """
@@ -111,9 +111,10 @@ class TimeCorrelatedNoise:
     slow_m, white_m : float
         Standard deviation of time-correlated (slow) and of white noise, per axis.
     gain_nats : float
-        Log-likelihood gain over white noise.
+        Log likelihood (nats) with time-correlated noise minus log likelihood with white noise.
     low_pass_gain_nats : float
-        Log-likelihood gain of a low-pass filter over time-correlated noise.
+        Log likelihood (nats) with a low-pass filter instead, minus log likelihood with
+        time-correlated noise.
     """
 
     tau_s: float

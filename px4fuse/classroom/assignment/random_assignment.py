@@ -45,8 +45,8 @@ DIFFICULT_FAULTS_PROBABILITY, MAX_FAULT_DIFFICULTY = 0.25, 1.5
 class AssignableFault(Record):
     """Type of fault that can be injected into a student's flight (``assignable_faults.csv``).
 
-    IMU gaps are not assigned: in half of the flights, the analysis reports a changed time offset
-    instead.
+    IMU gaps are not assigned: in half of the flights with an IMU gap, px4fuse reports a change of
+    the time offset instead of the gap.
 
     Attributes
     ----------
