@@ -194,8 +194,7 @@ def _read_trajectory(
 ) -> Trajectory:
     """Read a trajectory from a file, unless it is already read.
 
-    If the file is a flight log and its name contains no track (as in ``LOG:vio``),
-    ``default_track`` is read.
+    ``default_track`` is read from a flight log if ``source`` names no track (as ``LOG:vio`` does).
     """
     if isinstance(source, Trajectory):
         return source

@@ -108,7 +108,7 @@ class Match:
 
     @property
     def time_offset_fit(self) -> TrackFit:
-        """Fit from which the time offset is used.
+        """Fit that determines the time offset.
 
         A wrong yaw also makes the time offset wrong. If the yaw from the user is wrong, the time
         offset is therefore from the fit with the estimated yaw.

@@ -411,8 +411,11 @@ def _mark_explained_verdicts(
 ) -> tuple[Verdict, ...]:
     """Set ``is_explained`` in the verdicts that do not require a change of filter settings.
 
-    These are verdicts "overconfident" or "underconfident" of a filter whose settings shall be kept,
-    that is consistent against ground truth, or whose position source may drift.
+    A verdict "overconfident" or "underconfident" requires no change if
+
+    - the recommended action is to keep the settings of the filter,
+    - the filter is consistent against ground truth, or
+    - the filter is underconfident only against its source, and the source may drift.
     """
     filters_to_keep_unchanged = {
         name

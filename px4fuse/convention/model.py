@@ -47,9 +47,10 @@ class Convention(Record, kw_only=True, omit_defaults=False):
         "ambiguous": several conventions fit; "doubtful": the residuals are large; "not
         determinable": too little data or motion.
     rotation_deg : float
-        Clockwise rotation in addition to the directions of x, y and z.
+        Clockwise rotation (°) of the positions, in addition to the directions of x, y and z, which
+        are multiples of 90°.
     heading_from : {"EKF2", "gyroscopes", "GNSS"}
-        Reference of the rotation.
+        Source of the heading relative to which the rotation is measured.
     late_s : float
         Delay of the timestamps; negative if they are early.
     clock_drift : float

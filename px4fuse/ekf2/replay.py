@@ -574,7 +574,8 @@ def judge_with_logged_rejections(
 
     If replay and EKF2 reject different samples, they differ much even with a correct model.
     Therefore a second replay rejects the same samples as EKF2. The result is the agreement of the
-    second replay, judged with wider limits, with the rejections of the first replay.
+    second replay, judged with wider limits; only its numbers of rejections are from the first
+    replay.
 
     Parameters
     ----------

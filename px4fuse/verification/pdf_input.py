@@ -141,8 +141,8 @@ def _check_file(pdf: bytes) -> None:
     # find decompression bombs before pypdf reads the file
     remaining_bytes = MAX_DOCUMENT_BYTES
     for stream_match in _STREAM_START_PATTERN.finditer(pdf):
-        # compressed data follow the word "stream". The word may also occur inside other data: this
-        # does no harm, because bytes that are not zlib data have the size 0
+        # compressed data follow the word "stream". Each such word is tested, even inside other
+        # data; if no zlib data follow, the size is 0
         inflated_bytes = _estimate_inflated_bytes(
             pdf, stream_match.end(), min(remaining_bytes, MAX_CONTENT_BYTES)
         )
