@@ -133,7 +133,10 @@ def simulate_late_timestamps() -> list[Finding]:
 
 
 def rename_axes(log: AidLog, **names: str) -> AidLog:
-    """Give the axes of simulated innovations the names of a sensor; omit the other axes."""
+    """Rename the axes of simulated innovations, for use as innovations of another sensor.
+
+    ``names`` contains the new name of each axis to keep. All other axes are omitted.
+    """
     columns = {
         f"{quantity}_{old}": f"{quantity}_{new}"
         for old, new in names.items()

@@ -71,12 +71,14 @@ def compare(
     log : str, Path or Flight
         ULog or MAVLink recording, or a flight from :func:`px4fuse.read_log`.
     sigma_a_m_s2, sigma_z_m, dt_s, input
-        See :class:`px4fuse.Settings`. Default of SIGMA_Z: 0.1 m, but EKF2's noise for GNSS.
+        See :class:`px4fuse.Settings`. The default of SIGMA_Z is 0.1 m. For GNSS, it is the position
+        noise (1 σ) with which EKF2 fused GNSS.
     clock_offset_s : float or "auto", optional
         Time offset to add to the position timestamps. "auto" estimates it, and is the default with
         ``position``.
     axes : str or sequence of str
-        "north", "east", "down" or "aisle" (main direction of the track); default: all axes.
+        "north", "east", "down" or "aisle" (horizontal axis along the main direction of the track);
+        default: all axes.
     heading_deg : float, optional
         Heading of the axis "aisle", clockwise from north; default: main direction of the track.
     start_s, end_s : float, optional
@@ -190,7 +192,10 @@ def evaluate(
 def _read_trajectory(
     source: Pathlike | Trajectory, default_track: Literal["truth"] | None = None
 ) -> Trajectory:
-    """Read a trajectory; ``default_track`` is for a flight log."""
+    """Read a trajectory from a file, unless it is already read.
+
+    ``default_track`` is read from a flight log if ``source`` names no track (as ``LOG:vio`` does).
+    """
     if isinstance(source, Trajectory):
         return source
     return read_source(str(source), default_track=default_track).trajectory

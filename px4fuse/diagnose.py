@@ -14,17 +14,21 @@
       loop closure error
    e. find: faults of the flight, with their causes
 
-Time offsets are added to timestamps, so they are negative for late timestamps. In SourceTimeOffset,
-offset_s = applied_s + remaining_s: total estimate, offset added in step 2, and its error. A delay
-(late_s) has the opposite sign; it is 0 in convention_faults if it is too small to be a fault.
-refine_delay changes only the reported delay: the timestamps are not shifted again.
+Signs of time offsets and delays:
 
-If EKF2's positions, from which the time offset of a position file was estimated, are late, steps 2
-to 4 are repeated with the time offset from the IMU (_align_file_to_imu).
+- A time offset is added to the timestamps, so it is negative for late timestamps.
+- A delay (late_s) has the opposite sign.
 
-Other commands: :func:`diagnose_or_check_aids` also analyses flights without positions,
+Fields of SourceTimeOffset: offset_s is the estimated time offset, applied_s the part that step 2
+added to the timestamps, and remaining_s the rest. Step 4b changes only the reported delay: the
+timestamps are not shifted again.
+
+For a position file, step 1 estimates the time offset by comparison with EKF2's position. If step 4
+finds that EKF2's position is late, steps 2 to 4 are repeated with a time offset that is estimated
+with the IMU (_align_file_to_imu).
+
+Further functions: :func:`diagnose_or_check_aids` also analyses flights without positions,
 :func:`run_what_if` is ``px4fuse whatif``, and :func:`analyse_loop_closure` is ``px4fuse loop``.
-Between the steps, release_free_memory limits the peak memory.
 """
 
 from dataclasses import MISSING, fields, replace
@@ -112,11 +116,12 @@ def _diagnose_flight(request: ComparisonRequest, progress: Progress, flight: Fli
 
 
 def _align_file_to_imu(flight: Flight, analysis: Analysis) -> Flight | None:
-    """Replace the clock offset of a position file by the estimate from the IMU.
+    """Correct the clock offset of a position file by the time offset that the IMU gives.
 
-    The first estimate is from EKF2's positions, which may be late. The IMU estimate does not depend
-    on them, so it needs no second repetition. Return None if nothing changes. Without
-    clock_offset_sigma_s, the user gave the offset.
+    The clock offset was estimated by comparison with EKF2's position, which may be late. It is not
+    changed if the user gave it (clock_offset_sigma_s is None), if it does not depend on EKF2's
+    position, if the analysis found no error of it, or if the positions have wrong axes. Return None
+    in these cases.
     """
     alignment, time_offset = analysis.source.alignment, analysis.time_offset
     if (
@@ -280,11 +285,11 @@ def rerun(
 ) -> Reruns:
     """Explain the difference KF - EKF2, and re-run both filters with one change at a time.
 
-    Both steps find their replays in ``ekf2_model.runs`` by equality of the parameter sets.
+    All necessary EKF2 replays are computed at once, which is faster. Both analyses then take their
+    replays from ``ekf2_model.runs``, by the set of EKF2 parameters.
     """
     progress("replaying EKF2")
     estimated_settings = find_corrected_noise_settings(comparison, estimates.tuning)
-    # Replay all parameter sets at once, which is faster
     ekf2_model = prepare_ekf2_model(
         comparison.flight,
         lambda inputs: [

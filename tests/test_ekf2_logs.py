@@ -70,7 +70,7 @@ def test_ekf2_replay_of_flights_with_rejections_agrees_with_log(shared_logs, nam
     assert min(correlations) > REJECTING_FLIGHTS[name]
 
 
-def test_ekf2_replay_disagrees_with_log_if_86_percent_rejected(shared_logs):
+def test_replay_disagrees_if_ekf2_rejected_most_positions(shared_logs):
     """EKF2 rejects 86 % of the positions, and its variance is reduced by unlogged samples."""
     model = prepare_ekf2_model(read_log(shared_logs / "conventions" / "nwu_vio.ulg"))
     assert not isinstance(model, Unavailable)

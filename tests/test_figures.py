@@ -52,7 +52,7 @@ def test_answers_to_plot_questions_differ_between_faults() -> None:
 
 
 @pytest.mark.slow
-def test_plot_questions_of_same_secret_and_student_are_equal(monkeypatch) -> None:
+def test_same_student_always_gets_the_same_plots(monkeypatch) -> None:
     monkeypatch.setattr(figures, "FIGURE_COUNT", 1)
     random_number = partial(draw_uniform, b"secret", "s1", "aisle")
     content = draw_figures(random_number)

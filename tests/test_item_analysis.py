@@ -40,7 +40,7 @@ FORM = Answers(
 )
 
 
-def test_item_analysis_correlates_item_points_with_other_points() -> None:
+def test_rubric_item_points_are_correlated_with_other_points() -> None:
     for index, item in enumerate(analyse_items(REPORTS)):
         others = POINTS.sum(axis=1) - POINTS[:, index]
         expected = np.corrcoef(POINTS[:, index], others)[0, 1]
@@ -48,11 +48,11 @@ def test_item_analysis_correlates_item_points_with_other_points() -> None:
         assert (item.mean_points, item.max_points) == (POINTS[:, index].mean(), 10.0)
 
 
-def test_item_analysis_of_four_reports_gives_no_correlation() -> None:
+def test_four_reports_are_too_few_for_rubric_item_correlation() -> None:
     assert [item.discrimination for item in analyse_items(REPORTS[:4])] == [None] * 3
 
 
-def test_item_analysis_lists_answer_form_parts_and_faults() -> None:
+def test_class_statistics_list_answer_form_parts_and_faults() -> None:
     reports = [
         replace(
             each,
@@ -66,13 +66,13 @@ def test_item_analysis_lists_answer_form_parts_and_faults() -> None:
     assert (fault.mean_points, fault.max_points) == (0.6, 1.0)
 
 
-def test_item_analysis_excludes_items_not_yet_graded() -> None:
+def test_class_statistics_exclude_items_not_yet_graded() -> None:
     text = ItemScore("Text", 0.0, 20.0, "", True, True)
     reports = [replace(each, items=(*each.items, text)) for each in REPORTS]
     assert [item.title for item in analyse_items(reports)] == ["A", "B", "C"]
 
 
-def test_item_analysis_excludes_reports_pending_review() -> None:
+def test_class_statistics_exclude_reports_pending_review() -> None:
     reports = [replace(each, instructor_action="Decide.") for each in REPORTS]
     assert analyse_items(reports) == []
 

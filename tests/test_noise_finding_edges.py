@@ -184,7 +184,7 @@ def test_tune_does_not_advise_smaller_noise_for_gnss(
     assert dict(list_tuning_advice(flight, fitted)).keys() == expected
 
 
-def test_report_on_sigma_z_below_5_mm_states_limit_of_reruns() -> None:
+def test_finding_states_that_reruns_use_sigma_z_of_5_mm_or_more() -> None:
     bounded = tuned(NoiseEstimate(None, None, 0.0021))
     finding = only(noises.detect_wrong_settings, analysis(source=MOVING, tuning=bounded))
     assert finding.remedy == UNTESTED_SIGMA_Z

@@ -245,7 +245,7 @@ class TestScore:
         assert all("SIGMA_A is 0.5" in item.comment for item in made.items)
         assert made.instructor_action == ""
 
-    def test_unverified_report_points_are_pending_or_zero_by_rubric(self):
+    def test_rubric_decides_points_of_unverified_report(self):
         verdict = Verification("other log", ("no log",), False, remedy="Look.")
         made = assess_results(verdict=verdict)
         assert made.items[0].points == 0.0

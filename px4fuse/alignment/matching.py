@@ -108,7 +108,11 @@ class Match:
 
     @property
     def time_offset_fit(self) -> TrackFit:
-        """Fit with the estimated yaw if that of the user is wrong, which falsifies the offset."""
+        """Fit that determines the time offset.
+
+        A wrong yaw also makes the time offset wrong. If the yaw from the user is wrong, the time
+        offset is therefore from the fit with the estimated yaw.
+        """
         return self.fit_with_estimated_yaw if self.is_given_yaw_wrong else self.fit
 
     @property
@@ -122,12 +126,14 @@ class Match:
 def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
     """Match a position file with EKF2's position or, if this fails, with the IMU.
 
-    Return None if the match with EKF2 fails, but the user gave all alignment parameters.
+    If the user gave time offset, frame and yaw, the match only checks these parameters. Return None
+    if this check fails.
 
     Raises
     ------
     NoMatchError
-        Both fail, so a missing alignment parameter cannot be estimated.
+        The user did not give all parameters, and the missing ones cannot be estimated, because the
+        file matches neither EKF2's position nor the IMU.
     """
     missing_options = [
         f"`{name}`"

@@ -1,7 +1,8 @@
 """Differences in settings, numbers and findings between two results (``px4fuse diff``).
 
-``measures.csv`` lists the compared numbers: path in the results, label and unit. ``*`` in a path is
-any key, and ``FILTER`` the results of one filter along each axis.
+``measures.csv`` lists the compared numbers: path in the JSON results, label and unit. In a path,
+``*`` stands for any key. A path with ``FILTER`` stands for two paths: ``axes.*.filters.kf`` and
+``axes.*.filters.ekf2`` replace ``FILTER``.
 """
 
 import math
@@ -314,7 +315,11 @@ def _find_unshared_findings(
 def _describe_worse_verdicts(
     results_a: Results, results_b: Results, findings: Iterable[UnsharedFinding]
 ) -> Iterator[str]:
-    """Yield a sentence for each filter that is consistent only in A, and for each new error."""
+    """Yield a sentence for each deterioration from results A to results B.
+
+    A deterioration is a filter that is consistent in A but not in B, or a finding of severity
+    "error" that only B contains.
+    """
     nis_and_nees_a, nis_and_nees_b = map(_collect_nis_and_nees, (results_a, results_b))
     for label, (mean_a, was_consistent) in nis_and_nees_a.items():
         mean_b, is_consistent = nis_and_nees_b.get(label, (mean_a, True))

@@ -101,7 +101,10 @@ def collect_finding_values(findings: Iterable[Finding], aids: Mapping[str, AidRe
 
 
 def collect_card_values(card: Card) -> Row:
-    """Return headline, action and σ ratios of a flight for the table of ``px4fuse batch``."""
+    """Return the diagnosis of a flight as columns of the table of ``px4fuse batch``.
+
+    Columns: headline, recommended action, position RMSE, ratios of actual to reported σ, ...
+    """
     rmse_values_m = card.effect.position_rmse_m.values() if card.effect else ()
     return {
         "severity": card.severity,

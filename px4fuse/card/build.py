@@ -409,7 +409,14 @@ def _format_action(action: Action) -> str:
 def _mark_explained_verdicts(
     sigma_verdicts: Sequence[Verdict], causes: Sequence[DiagnosedCause], *, may_drift: bool
 ) -> tuple[Verdict, ...]:
-    """Mark the verdicts "overconfident" and "underconfident" that no filter setting corrects."""
+    """Set ``is_explained`` in the verdicts that do not require a change of filter settings.
+
+    A verdict "overconfident" or "underconfident" requires no change if
+
+    - the recommended action is to keep the settings of the filter,
+    - the filter is consistent against ground truth, or
+    - the filter is underconfident only against its source, and the source may drift.
+    """
     filters_to_keep_unchanged = {
         name
         for cause in causes

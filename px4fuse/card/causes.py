@@ -69,9 +69,14 @@ ACTION_TARGET_BY_FINDING_ID: Mapping[str, ActionTarget] = {
 
 
 class RankedCause(NamedTuple):
-    """Possible cause of a fault, its rank (0 first), and the re-runs that test it.
+    """Finding that may be the cause of an inconsistent filter, and the re-runs that test it.
 
-    ``log_sigma_ratio_reduction`` is the decrease of |ln(σ ratio)| in the re-runs.
+    Attributes
+    ----------
+    rank : int
+        Importance: 0 for the most important causes, 4 for the least important causes.
+    log_sigma_ratio_reduction : float
+        Decrease of |ln(actual σ ÷ reported σ)|, summed over the re-runs.
     """
 
     finding: Finding
@@ -183,7 +188,7 @@ def make_cause(
 
 
 def make_cause_without_reruns(finding: Finding) -> DiagnosedCause:
-    """Make a cause from the texts of a finding, without re-runs."""
+    """Describe the fault that a finding reports, if no re-run tests it."""
     return DiagnosedCause(
         id=finding.id,
         severity="error" if finding.severity == "error" else "warning",

@@ -26,7 +26,9 @@ MAX_HEADLINE_LENGTH = 84
 
 
 def map_ratio_to_axis(ratio: float) -> float:
-    """Map a σ ratio from 0.1 to 10 to a position from 0 to 1 on a logarithmic axis.
+    """Return the position (0 to 1) of a ratio on a logarithmic axis from 0.1 to 10.
+
+    The ratio is actual σ ÷ reported σ.
 
     >>> map_ratio_to_axis(0.1), map_ratio_to_axis(1.0), map_ratio_to_axis(10.0)
     (0.0, 0.5, 1.0)
@@ -102,7 +104,8 @@ class Action(Record):
     target : str
         Device or filter to be changed.
     sentence : str
-        Imperative, "keep the settings: <reason>", or "no <setting or option> …".
+        The action as an imperative. Otherwise, the reason why there is no action, which begins with
+        "keep the settings" or "no".
     where : {"shell", "console", ""}
         Program for the commands: shell of the computer, or MAVLink console of the vehicle.
     """
@@ -128,7 +131,8 @@ class CardRerun(Record, kw_only=True):
     from_s : float or None
         Start of the replay (s).
     position_rmse_m, source_ratio, truth_ratio, rejected_fraction : (float, float) or None
-        RMSE, σ ratios (source, ground truth) and rejected fraction, before and after the change.
+        Position RMSE, ratios of actual to reported σ (against position source and ground truth) and
+        rejected fraction, before and after the change.
     improves : str
         Quantities that the change improves.
     """
@@ -153,9 +157,9 @@ class DiagnosedCause(Record, kw_only=True):
     spans_s : tuple of (float, float)
         Times of the fault (s); empty for the whole flight.
     alternatives : tuple of tuple of Action
-        Groups of actions; one group is necessary.
+        Groups of actions. The user chooses one group and takes all its actions.
     actions : tuple of Action
-        Further necessary actions.
+        Actions that are necessary in addition to the chosen group.
     reruns : tuple of CardRerun
         Runs of KF and replays of EKF2 without the fault.
     after : str
@@ -216,8 +220,13 @@ class AnalysisDescription(Record, kw_only=True):
 class AidConsistency(Record, kw_only=True):
     """Consistency of one component (for example "north") of an EKF2 aiding source.
 
-    ``ratio`` is the RMS of innovation ÷ √S. ``is_usual`` is True for sensors whose ratio is usually
-    below 1 with PX4's default noise.
+    Attributes
+    ----------
+    ratio : float or None
+        RMS of innovation ÷ √S.
+    is_usual : bool
+        True for sensors whose ratio is usually below 1, because PX4's default noise is too large. A
+        small ratio is then not a fault.
     """
 
     label: str

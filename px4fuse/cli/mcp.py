@@ -105,7 +105,8 @@ def run_command(
 ) -> tuple[str, Any]:
     """Run a command in this process; return its terminal text, and its results (JSON) or None.
 
-    Of the results of ``compare``, only the diagnosis card is returned.
+    For ``compare``, the second value is only the diagnosis (faults, causes and actions), which is
+    the field ``card`` of the results.
 
     Parameters
     ----------

@@ -107,7 +107,10 @@ def progress(*output_paths: Path | None) -> Iterator[ShowProgress]:
 
 @contextmanager
 def folder_progress(folder: Path) -> Iterator[ShowProgress]:
-    """Provide the function of :func:`progress` for a run that can be continued in its folder."""
+    """Show the progress as :func:`progress` does, for a run that writes results to a folder.
+
+    If the user interrupts the run, the message says that the same command continues it.
+    """
     try:
         with progress() as show_progress:
             yield show_progress

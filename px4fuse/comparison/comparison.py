@@ -209,7 +209,10 @@ def _compute_rmse(error: Array) -> float:
 def find_compared_track(
     tracks: FilterTracks, ekf2_state: TableOrUnavailable
 ) -> tuple[TableOrUnavailable, TableOrUnavailable]:
-    """Return state and variance of a filter, at EKF2's sample times if EKF2 is logged."""
+    """Return the state and variance of a filter that are compared with ground truth.
+
+    EKF2: as logged. KF: predicted to EKF2's sample times, or to KF's steps if EKF2 is not logged.
+    """
     if tracks.run is None:
         return tracks.state, tracks.variance
     times_s = (tracks.run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state).index

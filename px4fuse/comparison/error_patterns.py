@@ -125,9 +125,10 @@ class LocalResiduals(NamedTuple):
     Attributes
     ----------
     residual_m : ndarray, shape (n, 2)
-        Deviation of the horizontal position, scaled to the σ of the position noise.
+        Deviation of the horizontal position. The noise of the neighbours increases the deviation.
+        It is therefore scaled, so that its σ equals the σ of white position noise.
     timestamp_jitter_s : ndarray, shape (n,)
-        Deviation of the timestamp, scaled in the same way.
+        Deviation of the timestamp, scaled in the same way to the σ of white timestamp jitter.
     ekf2_speed_m_s : ndarray, shape (n,), or None
         EKF2's horizontal speed.
     """
@@ -146,7 +147,7 @@ class ErrorFit(NamedTuple):
     residual_m : ndarray, shape (n, 2)
         Remaining error against ground truth.
     columns : ndarray, shape (n, 2, 5)
-        Effects of the five fitted parameters.
+        Derivatives of the position error with respect to the five fitted parameters.
     """
 
     time_s: Array
@@ -159,12 +160,19 @@ class ErrorFit(NamedTuple):
     scale_error_sigma: float
 
     def compute_slow_error_mean_square_m2(self) -> float:
-        """Return the mean square (m²) of the residuals without white noise."""
+        """Return the mean square (m²) of the residuals minus the variance of the white noise.
+
+        The difference is the mean square of the slow (time-correlated) errors.
+        """
         return float(np.mean(self.residual_m**2, axis=0).sum()) - 2.0 * self.white_noise_sigma_m**2
 
 
 class PeriodicError(NamedTuple):
-    """Sinusoidal position error, and its ``fraction`` of the mean square slow error."""
+    """Sinusoidal position error.
+
+    ``fraction`` is the mean square of the sinusoidal error divided by the mean square of all slow
+    (time-correlated) position errors.
+    """
 
     period_s: float
     amplitude_m: float
@@ -454,8 +462,9 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     moving_part_indices = np.flatnonzero(mean_square_speeds > MIN_SPEED_FOR_OFFSET_M_S**2)
     if len(moving_part_indices) < 2:
         return None
-    # Remove the best time offset of each flight part from errors and columns, then fit the constant
-    # parameters
+    # Fit one time offset per flight part together with parameters that are constant in flight. To
+    # solve this fit in two steps, first remove the best time offsets of the flight parts from the
+    # errors and from the Jacobian columns, then fit the constant parameters
     error_per_time_offset_m_s = -fit.velocity_m_s
     inverse_square_speed_sums = np.zeros_like(square_speed_sums)
     inverse_square_speed_sums[moving_part_indices] = 1.0 / square_speed_sums[moving_part_indices]

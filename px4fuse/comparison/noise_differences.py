@@ -24,7 +24,11 @@ MIN_PART_MEASUREMENTS = 25
 
 
 class NoisyPart(NamedTuple):
-    """Time span (s) with larger innovations than the rest of the flight, and ratio of their σ."""
+    """Time span (s) with larger innovations than the rest of the flight.
+
+    ``sigma_ratio`` is σ of the innovations in the time span ÷ σ in the rest of the flight.
+    ``sigma_ratio_without_outliers`` is computed without the detected outliers.
+    """
 
     start_s: float
     end_s: float
@@ -58,8 +62,9 @@ def tune_perpendicular_axes(comparison: Comparison) -> tuple[AxisTuning, ...]:
 def _find_heading_of_largest_noise(north_and_east: Sequence[AxisComparison]) -> float | None:
     """Return the heading (°, 0 to 180) of the largest noise, if north and east are correlated.
 
-    Slow errors cancel in the changes of KF's innovation between two samples. The correlation
-    of these changes is sin(π/2 · mean(sign(north) · sign(east))) (Blomqvist 1950).
+    The noise is estimated from differences of successive innovations of KF, in which slow errors
+    cancel. The correlation of north and east is computed from the signs of these differences:
+    sin(π/2 · mean(sign(north) · sign(east))) (Blomqvist 1950).
     """
     innovations_m = [axis.kf_run.updates["innovation_m"] for axis in north_and_east]
     innovation_changes_m = (

@@ -62,8 +62,9 @@ def prepare_comparison_inputs(
 ) -> PreparedComparison:
     """Choose position source, segment and axes of a flight for the comparison of KF with EKF2.
 
-    ``keep_positions_as_sent`` skips the check and correction of axes, unit and clock, for lists of
-    the log's contents and for exercises in which students must find such faults.
+    With ``keep_positions_as_sent``, axes, unit and clock of the positions are neither checked nor
+    corrected. This is used to list the contents of a log, and for exercises in which students must
+    find such faults.
 
     Raises
     ------
@@ -124,7 +125,11 @@ def prepare_comparison_inputs(
 def _correct_convention(
     flight: Flight, source: PositionTrack, settings: Settings, *, is_checked: bool
 ) -> tuple[Flight, PositionTrack, Settings, Convention | None]:
-    """Check and correct axes, unit, clock and orientation of the positions, unless in NED."""
+    """Check and correct axes, unit, clock and orientation of the positions.
+
+    Positions that are already in NED are not checked: GNSS, and positions that EKF2 aligned with
+    its own frame.
+    """
     is_in_ned = source.origin.is_gnss or source.origin.route == ALIGNED_BY_EKF2_ORIGIN.route
     convention = check_convention(flight, source) if is_checked and not is_in_ned else None
     # A time offset from the user replaces the detected one

@@ -94,7 +94,11 @@ def remove_origin_resets(
 def _make_states_without_resets(
     published_state: pd.DataFrame, resets: list[Reset], axes: list[int]
 ) -> Iterator[pd.DataFrame]:
-    """Yield EKF2's positions without resets, in the frame of each interval between resets."""
+    """Yield EKF2's positions with all reset jumps removed, once for each possible origin.
+
+    n resets divide the flight into n + 1 intervals with different origins. Each yielded table
+    expresses all positions relative to the origin of one interval.
+    """
     reset_m = np.array([reset.delta for reset in resets])[:, axes]
     is_after_reset = np.array([published_state.index >= reset.time_s for reset in resets]).T
     for earlier_count in range(len(resets) + 1):

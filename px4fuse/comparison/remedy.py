@@ -41,8 +41,13 @@ def estimate_gnss_delay_ms(
 ) -> tuple[float, float] | None:
     """Estimate the GNSS delay and its σ (ms) by replays of EKF2 with values of EKF2_GPS_DELAY.
 
-    Return None if the delay does not differ significantly from the logged delay, or if the vision
-    that GNSS is compared with was not checked, or has a wrong convention or time offset.
+    The estimate is the delay with the smallest NIS of GNSS position and velocity. Vision positions
+    are the reference. Return None if
+
+    - the estimated delay does not differ significantly from the logged delay,
+    - vision is missing, or is not the position source of KF, so it was not checked,
+    - vision has wrong axes, a wrong unit or a wrong time offset, or
+    - GNSS has no velocity, or timestamps of the sender.
     """
     received_positions, vision = model.inputs.received_positions, model.inputs.vision_positions
     if (
@@ -195,7 +200,11 @@ def find_delay_max_change(
 def make_estimated_noise_change(
     ekf2_inputs: ReplayInputs, noise_estimate: NoiseEstimate, noise_m: float
 ) -> dict[str, float]:
-    """Return EKF2 parameters for ``noise_m``, if EKF2's noise differs from the estimate."""
+    """Return the EKF2 parameters that set the position noise to ``noise_m``.
+
+    Return no parameters if the noise that EKF2 used is within the 95 % interval of
+    ``noise_estimate``, so that no change is necessary.
+    """
     if (
         (noise_estimate.low or 0.0)
         <= find_used_noise_m(ekf2_inputs)

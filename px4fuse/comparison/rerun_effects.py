@@ -105,10 +105,11 @@ class Rerun(Record, kw_only=True):
 
 
 def compute_explained_fraction(rerun: Rerun, statistic: Statistic) -> float:
-    """Return the fraction of ln(mean NIS) or ln(mean NEES) that a change removes.
+    """Return the fraction of an inconsistency that disappears with the change of a re-run.
 
-    For "difference": fraction of the mean square difference KF - EKF2. Above 1, the change is too
-    large.
+    - "nis", "nees": fraction of ln(mean NIS) or ln(mean NEES). It is 1 if the mean is 1 after the
+      change, and above 1 if the change overshoots.
+    - "difference": fraction of the mean square difference KF - EKF2.
     """
     before, after = rerun.before.value(statistic), rerun.after.value(statistic)
     if not before or not after:
@@ -206,7 +207,8 @@ def compute_sigma_ratio_deviation(statistics: RunStatistics) -> float:
 def compute_preference_key(rerun: Rerun) -> tuple[bool, int, float]:
     """Return a key to sort re-runs, best first.
 
-    In the best re-run, few changes make the filter consistent.
+    Re-runs that make the filter consistent are best, and among them those with few changes. The
+    other re-runs are sorted by the remaining deviation of the reported σ.
     """
     is_made_consistent = becomes_consistent(rerun)
     return (
@@ -246,7 +248,11 @@ def becomes_consistent(rerun: Rerun, tested_reference: Reference | None = None) 
 
 
 def halves_discrepancy(rerun: Rerun) -> bool:
-    """Return True if a re-run halves |ln(σ ratio)| of an inconsistent filter."""
+    """Return True if a re-run at least halves |ln(actual σ ÷ reported σ)|.
+
+    Only ratios outside the limits of a consistent filter are tested, against position source and
+    ground truth.
+    """
     return any(
         classify_sigma_ratio(ratio_before, reference) != "consistent"
         and abs(math.log(ratio_after)) <= 0.5 * abs(math.log(ratio_before))
@@ -288,7 +294,11 @@ def find_rerun(
 
 
 def has_effect(rerun: Rerun) -> bool:
-    """Return True if a re-run changes a σ ratio by 10 % or the position RMSE by 5 %."""
+    """Return True if a re-run changes the filter's results noticeably.
+
+    The ratio of actual to reported σ changes by more than 10 %, or the position RMSE by more than
+    5 %.
+    """
     rmse_before_m, rmse_after_m = rerun.before.position_rmse_m, rerun.after.position_rmse_m
     if (
         rmse_before_m

@@ -75,8 +75,8 @@ from px4fuse.flight.model import Columns, Spans, Unavailable
 
 # Mean NIS above which innovations are too large for the reported σ
 MAX_NORMAL_NIS = 1.5
-# Re-runs of EKF2 are compared with the log if the unchanged replay and the log differ by at most
-# this factor in RMSE and σ ratio, and otherwise with the unchanged replay
+# Maximum factor between unchanged replay and log, in RMSE and in actual σ ÷ reported σ. Up to this
+# factor, changed replays of EKF2 are compared with the log; otherwise with the unchanged replay
 MAX_REPLAYED_TO_LOGGED_ERROR_RATIO = 1.10
 
 
@@ -276,7 +276,12 @@ def _rerun_with_changes(
 def _find_statistics_without_change(
     tested_filter: _Filter, axis_result: AxisComparison
 ) -> tuple[RunStatistics, bool]:
-    """Return the statistics without a change, and True if they are from the log."""
+    """Return the statistics with which the re-runs of a filter are compared.
+
+    KF: statistics of the original run. EKF2: statistics of the log or, if the unchanged replay
+    differs too much from the log, of the unchanged replay. The second value is False only for
+    statistics of a replay.
+    """
     replayed, ekf2 = tested_filter.rerun(axis_result, {}), axis_result.ekf2
     evaluated_spans_s, innovations = tested_filter.evaluated_spans_s, ekf2.innovations
     if evaluated_spans_s is None:

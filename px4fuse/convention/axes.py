@@ -163,7 +163,8 @@ class Hypothesis:
     has_rotation : bool
         False if the rotation is fixed to a multiple of 90°.
     min_source_to_imu_displacement_ratio, max_source_to_imu_displacement_ratio : float
-        Bounds of the ratio of displacements, source to IMU.
+        Bounds of the scale factor of the positions: displacement according to the source ÷
+        displacement according to the IMU. Noise of the source affects only the upper bound.
     residual_sigma_m : float
         Scale (m) of the Student distribution of the horizontal residuals.
     independent_residual_count : float
@@ -534,7 +535,10 @@ def _compute_total_log_odds(hypothesis: Hypothesis, positions: SentPositions) ->
 def _compute_height_log_likelihood_ratio(
     hypothesis: Hypothesis, positions: SentPositions, barometer_down_m: "pd.Series[float]"
 ) -> float:
-    """Return the log likelihood ratio of barometer heights to a constant height."""
+    """Return the log likelihood ratio (nats) of two models of the barometer height.
+
+    First model: the height according to the hypothesis. Second model: a constant height.
+    """
     height_m = -np.interp(
         positions.time_s - hypothesis.delay_s, barometer_down_m.index, barometer_down_m
     )

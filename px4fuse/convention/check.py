@@ -242,8 +242,10 @@ def _choose_convention(
 ) -> Convention:
     """Return the first of ``hypotheses`` (best first) as convention, with verdict and alternatives.
 
-    The positions are rotated against the heading of their first axis. The scale is the regression
-    of displacements on those of the IMU: position noise does not bias it.
+    ``rotation_deg`` has the opposite sign of the estimated heading: in a frame that is rotated
+    clockwise, the positions appear rotated counterclockwise. The scale is the regression
+    coefficient of the source's displacements on the displacements of the IMU, because noise of the
+    source does not bias this coefficient.
     """
     best_hypothesis = hypotheses[0]
     # Without heights, z up and z down fit equally well

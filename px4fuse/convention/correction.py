@@ -188,10 +188,11 @@ def convert_to_px4_convention(
 
 
 def _replace_attitude(flight: Flight, convention: Convention, faults: ConventionFaults) -> Flight:
-    """Replace an attitude that EKF2 computed with wrong positions by that from the gyroscopes.
+    """Replace EKF2's attitude by the attitude from the gyroscopes, if EKF2 fused wrong positions.
 
-    The detected rotation and x direction are relative to the heading of this attitude. If the axes
-    of the positions are not corrected, their x axis is north, so the attitude is rotated to it.
+    The heading of the new attitude must fit the frame of the positions. If the position axes are
+    not corrected, their x axis is used as north. The attitude is then rotated by the detected angle
+    between its north and the x axis.
     """
     inertial_data = integrate_inertial_data(flight) if faults.affects_ekf2 else None
     if inertial_data is None:
@@ -223,7 +224,7 @@ def _make_matrix_to_ned_metres(convention: Convention, faults: ConventionFaults)
 
 
 def _multiply_known_values(values: Array, matrix: Array) -> Array:
-    """Multiply each row by a matrix. NaN values with weight 0 are ignored."""
+    """Multiply each row by a matrix. NaN values with the matrix coefficient 0 are ignored."""
     is_unknown = np.isnan(values).astype(float) @ (matrix != 0.0).T > 0.0
     return np.where(is_unknown, np.nan, np.nan_to_num(values) @ matrix.T)
 

@@ -47,19 +47,22 @@ class Convention(Record, kw_only=True, omit_defaults=False):
         "ambiguous": several conventions fit; "doubtful": the residuals are large; "not
         determinable": too little data or motion.
     rotation_deg : float
-        Clockwise rotation in addition to the directions of x, y and z.
+        Clockwise rotation (°) of the positions, in addition to the directions of x, y and z, which
+        are multiples of 90°.
     heading_from : {"EKF2", "gyroscopes", "GNSS"}
-        Reference of the rotation.
+        Source of the heading relative to which the rotation is measured.
     late_s : float
         Delay of the timestamps; negative if they are early.
     clock_drift : float
         Rate of the sender's clock minus 1.
     scale : float
-        Ratio of displacements, source to IMU.
+        Scale factor of the positions: displacement according to the source ÷ displacement
+        according to the IMU.
     log_odds : float or None
-        Log odds of the best convention to the second best.
+        Log odds (nats) of the best convention to the second best.
     log_likelihood_gain : float
-        Log likelihood ratio to positions that do not depend on the motion.
+        Log likelihood ratio (nats, with prior odds) of this convention to a model in which the
+        positions are unrelated to the motion that the IMU measures.
     alternatives : tuple of str
         Other axes, units and delays that fit nearly as well.
     """

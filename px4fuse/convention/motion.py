@@ -138,7 +138,7 @@ class ImuSecondDifferences:
 
     @cached_property
     def second_difference_derivative_m_s(self) -> Array:
-        """Time derivative of the second difference, shape (n, 3)."""
+        """Time derivative (m/s) of the second difference of the position, shape (n, 3)."""
         return np.gradient(self.table[..., 0], GRID_INTERVAL_S, axis=0)
 
 
@@ -187,9 +187,10 @@ def integrate_inertial_data(flight: Flight) -> InertialData | None:
 
 
 def _integrate_gyros(rotation_rad: Array, logged_attitude: Array) -> Array:
-    """Integrate the gyroscopes without their bias, from the first logged attitude.
+    """Subtract the bias of the gyroscopes and integrate them from the first logged attitude.
 
-    The bias is a median, so heading resets have no effect.
+    The bias is estimated from the difference between gyroscopes and logged attitude, as the median
+    over time windows. The median limits the effect of heading resets in the logged attitude.
     """
     gyro_error_rad = rotation_rad - to_rotation_vector(
         multiply(conjugate(logged_attitude[:-1]), logged_attitude[1:])

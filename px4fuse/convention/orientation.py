@@ -46,10 +46,10 @@ MAX_TILT_DIFFERENCE_DEG = 6.0
 # If the median heading difference (°) between orientation and gyroscope attitude is larger with
 # the best convention, the orientation is unrelated to the vehicle's attitude
 MAX_HEADING_DIFFERENCE_DEG = 12.0
-# In the score of a convention, smaller median angle differences (°) count as this value, because
-# they are noise
+# The score of a quaternion convention measures its agreement with the reference attitude. Lower
+# limit (°) of the median angle differences in the score: smaller differences are noise
 MIN_ANGLE_DIFFERENCE_IN_SCORE_DEG = 0.7
-# The score of a convention decreases by this factor · duration (s) · ln(median angle difference)
+# The score decreases by this factor · duration (s) · ln(median angle difference)
 ANGLE_DIFFERENCE_WEIGHT_PER_S = 0.5
 # For the verdict "determined", the score of the best convention must exceed that of the second best
 # by this value

@@ -29,9 +29,15 @@ def append_opposites(axes: AxisDirections) -> list[Direction]:
 
 
 def find_axes_in_file(axes: AxisDirections, frame: str) -> AxisDirections:
-    """Return the true directions of x, y, z in a file that was read with a wrong ``frame``.
+    """Return the true directions of the columns x, y, z of a position file.
 
-    ``axes`` are the true directions of the components read as north, east and down.
+    Parameters
+    ----------
+    axes : tuple of Direction
+        True directions of the file's positions, after conversion from ``frame`` to NED. If
+        ``frame`` is wrong, these directions are not north, east, down.
+    frame : str
+        Frame from which the positions were converted to NED, for example "ENU".
     """
     true_directions = dict(zip(DIRECTIONS, append_opposites(axes), strict=True))
     x, y, z = (true_directions[name] for name in FRAME_AXES[frame])

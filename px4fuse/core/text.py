@@ -249,7 +249,10 @@ def neutralise_formulas(text: str) -> str:
 
 
 def _is_formula(text: str) -> bool:
-    """Return True if the first visible character can begin a formula."""
+    """Return True if a spreadsheet may execute the text as a formula.
+
+    This depends on the first visible character, for example "=".
+    """
     if re.fullmatch(r"[+-][0-9]+", text):  # signed integer, for example a student id
         return False
     if text.startswith(("\t", "\r")):

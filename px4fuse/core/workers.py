@@ -221,7 +221,11 @@ def _run_worker(
 
 
 def _run_and_pickle(function: Callable[[Any], Any], job: Any) -> bytes:
-    """Run a job; return a pickled pair: True if further jobs can run, and the result."""
+    """Run a job; return a pickled pair of a flag and the result.
+
+    The flag is False if the memory was not sufficient. The parent process must then end this worker
+    process, because it would not have enough memory for the next job.
+    """
     try:
         return pickle.dumps((True, function(job)), pickle.HIGHEST_PROTOCOL)
     except MemoryError:

@@ -61,7 +61,8 @@ def estimate_barometer_interval_s(fusion_record: FusionRecord) -> float:
 def _compute_bias_gain(barometer_bias_updates: pd.DataFrame) -> Array:
     """Return the Kalman gain K of the logged updates of the barometer bias.
 
-    K - K² = bias variance after the update / innovation variance.
+    The log contains the innovation variance S and the bias variance P after the update. The bias is
+    the only state, so P = (1 - K) K S. The result is the smaller solution of K - K² = P / S.
     """
     posterior_to_innovation_variance_ratio = (
         barometer_bias_updates["bias_m2"] / barometer_bias_updates["variance_m2"]
@@ -90,8 +91,10 @@ def _combine_barometer_samples(
 ) -> pd.Series:
     """Return the barometer heights (m, down) that EKF2 fused, by time (s).
 
-    The log contains only some of them. The others follow from ``logged_down_m``, from the bias
-    updates of EKF2 and from its filtered innovation.
+    EKF2's logged height updates contain only some of the fused samples. Missing heights are taken
+    from ``logged_down_m`` (barometer topic), or computed from the logged updates of the barometer
+    bias. The remaining gaps are filled with random heights that agree with EKF2's logged filtered
+    innovation.
     """
     logged_barometer_updates = ekf2.aids[BAROMETER.name].samples
     if "observation_down" not in logged_barometer_updates or len(logged_barometer_updates) < 2:
@@ -213,10 +216,14 @@ def _simulate_missing_innovations(
 ) -> Array:
     """Replace missing innovations by random values that agree with the logged filtered innovation.
 
+    EKF2 logs fewer rows than it fuses samples: up to k samples are fused between two logged rows.
+    Each logged row contains the low-pass filtered innovation, which restricts the mean of the
+    missing innovations before the row. Their scatter is random.
+
     Parameters
     ----------
     innovation_m, is_missing : ndarray, shape (n, k)
-        Up to k innovations before each of n logged rows.
+        Innovations of the samples in n intervals between logged rows, and True for unknown ones.
     interval_s : ndarray, shape (n, 1)
         Sample interval.
     age_in_samples : ndarray, shape (n, k)

@@ -785,9 +785,11 @@ def _compute_correlation(P: Array) -> Array:
 
 
 def _compute_steady_state_correlation(segment: ReplaySegment) -> Array:
-    """Return the correlation matrix of the states after a long fusion of velocity.
+    """Return the correlation matrix of the states after EKF2 has fused velocity for a long time.
 
-    The errors of tilt and accelerometer bias are correlated: their acceleration errors cancel.
+    Velocity measurements determine only the sum of two acceleration errors: the error due to tilt
+    and the error due to accelerometer bias. The two state errors are correlated, so that their
+    effects on the acceleration cancel.
     """
     state_rotation_to_ned = np.eye(STATE_COUNT)
     state_rotation_to_ned[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = segment.body_to_ned[0]

@@ -263,7 +263,11 @@ def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
 
 
 def _check_quality(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
-    """Yield a condition if EKF2 never saw enough successive positions with EKF2_EV_QMIN."""
+    """Yield an unmet condition of fusion if the quality of the positions is too small.
+
+    EKF2 fuses positions only if several successive positions have a quality of at least
+    EKF2_EV_QMIN.
+    """
     min_quality, status = positions.parameters.get("EKF2_EV_QMIN", 0.0), positions.source.status
     if min_quality <= 0.0 or "quality" not in status:
         return

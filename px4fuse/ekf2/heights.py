@@ -146,7 +146,7 @@ class BadAccelerationFlag:
     Parameters
     ----------
     uses_logged_flag : ndarray of bool, shape (filters,)
-        True to use the logged flag.
+        True to use the logged flag instead of a computed flag.
     flag_duration_s : float
         Time for which the flag stays set after a large innovation.
 
@@ -189,15 +189,17 @@ class BadAccelerationFlag:
         return np.asarray(np.maximum(overlap_s, 0.0) / np.maximum(end_s - begin_s, 1e-9))
 
     def update(self, time_s: Array, previous_innovations: Array, innovations: Array) -> None:
-        """Update the modelled flag after a fusion of heights.
+        """Update the flag for a bad vertical acceleration after a fusion of heights.
+
+        Configurations that use the logged flag are not changed.
 
         Parameters
         ----------
         time_s : ndarray, shape (filters,) or (1,)
             Time of the fusion.
         previous_innovations, innovations : ndarray, shape (k + 1, filters)
-            Normalised height innovations (√S, positive upwards): k of the barometer, one of GNSS.
-            NaN without a sample.
+            Height innovations ÷ √S (positive upwards) of the previous and of this event: k of the
+            barometer, then one of GNSS. NaN without a sample.
         """
         *previous_barometer, previous_gnss = previous_innovations
         *barometer, gnss = innovations

@@ -73,7 +73,9 @@ class EventIntervals:
     prediction_step_counts, duration_s : ndarray, shape (E,)
         Number of prediction steps, and length of each interval.
     state_derivatives : ndarray, shape (E, 9, DERIVATIVE_COLUMN_COUNT)
-        Derivatives of attitude, velocity and position, see DERIVATIVE_COLUMN_COUNT.
+        Derivatives of attitude error, velocity and position at the end of each interval, with
+        respect to initial attitude error, gyro bias and accelerometer bias. The last two columns
+        are the state changes by EKF2's attitude correction and by the measured acceleration.
     """
 
     events: StepEvents
@@ -217,8 +219,9 @@ def _find_fusion_actions(
     end_steps: IntArray,
     is_usable: BoolArray,
 ) -> tuple[IntArray, BoolArray]:
-    """Return EKF2's action on each sample, and True for samples that may start fusion.
+    """Return EKF2's action on each position sample, and True for samples that may start fusion.
 
+    The actions are FUSE, START_FUSION (reset the position to the sample) and NO_ACTION.
     Source: PX4-Autopilot ``ev_control.cpp``.
     """
     fusion_rules = inputs.rules
@@ -247,9 +250,11 @@ def _find_fusion_actions(
 def _integrate_state_derivatives(
     segment: ReplaySegment, start_steps: IntArray, end_steps: IntArray
 ) -> Array:
-    """Return the derivatives of attitude, velocity and position over each interval.
+    """Return the derivatives of the motion state at the end of each interval.
 
-    Columns: see DERIVATIVE_COLUMN_COUNT.
+    Rows: attitude error, velocity and position. Columns: derivatives with respect to initial
+    attitude error (3), gyro bias (3) and accelerometer bias (3); then the changes of the state by
+    EKF2's attitude correction (1) and by the measured acceleration (1).
     """
     prediction_step_counts = end_steps - start_steps
     # All intervals are integrated together, step by step. Sorted by length, the intervals that have

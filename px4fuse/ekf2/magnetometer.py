@@ -74,7 +74,10 @@ def fuse_mean_sample(
     measured_states: slice,
     bias_states: slice | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Fuse the mean of magnetometer or optical flow samples.
+    """Fuse the mean of several magnetometer or optical flow samples as one measurement.
+
+    EKF2 fuses each sample separately. The gate and the returned innovation variance therefore use
+    the noise of one sample; the update of the state uses the smaller noise of the mean.
 
     Return state, covariance, and an array of shape (3, filters, components). Its rows are the
     innovation, the innovation variance of one sample, and 1 if fused; NaN without a sample.
@@ -82,7 +85,7 @@ def fuse_mean_sample(
     Parameters
     ----------
     gate : ndarray, shape (filters,)
-        Innovation gate in √S.
+        Maximum accepted |innovation|, as a multiple of √S.
     measured_states : slice
         State indices of the measured vector (NED).
     bias_states : slice, optional

@@ -106,10 +106,17 @@ def prepare_ekf2_model(
 ) -> Ekf2Model | Unavailable:
     """Prepare EKF2 replays of a flight, and replay the flight with the logged parameters.
 
-    ``list_later_configurations`` returns further filter configurations to compute.
-    ``failed_agreement_by_aid`` contains the aiding sources to omit, with the agreement of the
-    replay that fused them. If further aiding sources do not agree with the log, the function calls
-    itself without them.
+    If the replay does not agree with the log for an aiding source, the function calls itself and
+    omits this source.
+
+    Parameters
+    ----------
+    list_later_configurations : callable
+        Function that returns the filter configurations that later analyses need. They are computed
+        together with the logged configuration, which is faster.
+    failed_agreement_by_aid : mapping from PX4's name to Agreement
+        Aiding sources to omit, with the agreement of the replay that still fused them. Only the
+        function itself passes this argument.
     """
     omitted_aids = {
         name: agreement.doubtful[name] for name, agreement in failed_agreement_by_aid.items()
@@ -305,9 +312,9 @@ def misalign_positions(model: Ekf2Model, rotation_deg: float, delay_s: float) ->
 def compute_delayed_tracks(
     model: Ekf2Model, configurations: Sequence[FilterConfiguration]
 ) -> Iterator[pd.DataFrame]:
-    """Yield position and velocity at the fusion horizon for each filter configuration.
+    """Yield a table of position and velocity for each filter configuration.
 
-    The fusion horizon is EKF2's delayed time. A run contains all configurations of one segment.
+    The table covers the whole flight, and contains EKF2's delayed state at the fusion horizon.
     """
     runs = _run_model(model, configurations)
     for index in map(runs[0].configurations.index, configurations):
@@ -540,7 +547,11 @@ def _propagate_states(
     body_to_ned, step_s = segment.body_to_ned[1:][steps], segment.step_s[steps, None]
 
     def integrate(rows: slice, increments: Array) -> ArrayPair:
-        """Return the states in ``rows`` before and after each step: event state plus increments."""
+        """Return the state elements ``rows`` before and after each prediction step.
+
+        In each interval, they are the state after the fusion plus the sum of the increments since
+        then.
+        """
         sums = cumulative_sums(increments)
         sums_at_events = sums[first_steps[:-1] - first_steps[0]]
         offsets = np.repeat(event_states[:, rows] - sums_at_events, interval_lengths, axis=0)

@@ -46,6 +46,8 @@ def compute_published_state(
     reset_m : ndarray, shape (n + 1, 3)
         Sum of the position resets so far.
     published_minus_nominal_attitude_rad : ndarray, shape (n + 1, 3)
+        Small rotation from the nominal attitude (published by EKF2 in the log) to the attitude that
+        the output predictor of the replay publishes.
     lag_steps : int
         Number of prediction steps from the fusion horizon to the present.
     settings : mapping

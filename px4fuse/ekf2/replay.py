@@ -118,11 +118,13 @@ class Agreement(Record, kw_only=True):
     decisions_same : float
         Fraction of samples that EKF2 and replay both rejected or both accepted.
     published_rms_difference_m : float
-        RMS difference of the published horizontal position.
+        RMS difference between replayed and logged horizontal position, as published.
     heading_rms_difference_deg : float or None
-        None if the replay uses the logged heading.
+        RMS difference between replayed and logged heading; None if the replay uses the logged
+        heading.
     carried_difference_m : float or None
-        Largest position difference with optical flow as the only horizontal source.
+        Largest horizontal difference between replayed and logged position in the time with optical
+        flow as the only horizontal aiding source.
     doubtful : mapping from PX4's name of an aiding source to str
         Aiding sources that do not agree with the log, and the reasons.
     good : bool
@@ -568,9 +570,19 @@ def _format_unlike_limit(value: float, limit: float) -> str:
 def judge_with_logged_rejections(
     agreement: Agreement, agreement_with_logged_rejections: Agreement
 ) -> Agreement:
-    """Return the agreement with the log for a flight with many rejections.
+    """Judge the agreement of replay and log for a flight in which EKF2 rejected many samples.
 
-    ``agreement_with_logged_rejections`` is from a replay that rejects the same samples as EKF2.
+    If replay and EKF2 reject different samples, they differ much even with a correct model.
+    Therefore a second replay rejects the same samples as EKF2. The result is the agreement of the
+    second replay, judged with wider limits; only its numbers of rejections are from the first
+    replay.
+
+    Parameters
+    ----------
+    agreement : Agreement
+        Agreement of the replay that decides itself on rejections.
+    agreement_with_logged_rejections : Agreement
+        Agreement of the replay that rejects the same samples as EKF2.
     """
     rejected_fraction = agreement.rejected_fraction_logged
     is_mostly_rejected = rejected_fraction > MOSTLY_REJECTED_FRACTION

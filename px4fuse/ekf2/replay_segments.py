@@ -117,7 +117,7 @@ class SensorSamples:
     noise : ndarray, shape (m,)
         R of one sample; 0 if an EKF2 parameter determines R.
     gate : float
-        Innovation gate in √S; infinite if an EKF2 parameter determines the gate.
+        Maximum accepted |innovation| ÷ √S; infinite if an EKF2 parameter determines the gate.
     state_slices : tuple of slice
         State indices of the measured vector (NED) and of the sensor bias (body frame).
     """
@@ -162,7 +162,8 @@ class HeightSamples:
 class ReplaySegment:
     """Part of a flight without gaps, with n prediction steps of EKF2.
 
-    The nominal attitude is EKF2's published attitude. Vectors are in NED by default.
+    The nominal attitude is the attitude that EKF2 published in the log. Vectors are in NED by
+    default.
 
     Attributes
     ----------
@@ -191,9 +192,11 @@ class ReplaySegment:
     mean_bias_down_m_s2 : float
         Mean vertical accelerometer bias.
     internal_to_published_position_ratio : float or ndarray, shape (3,)
-        Ratio of EKF2's internal to its published position along each axis.
+        Ratio of EKF2's internal to its published position along each axis. It is not 1 since PX4
+        v1.16, which computes positions on an ellipsoid but publishes them on a sphere.
     preceding_segment : ReplaySegment or None
-        Flight before the start, from which the correlations are estimated.
+        Seconds of the flight before this segment. Their replay gives the correlations of the
+        initial state, which are not logged.
     changed_parameters : mapping from PX4's name to float
         Parameters that were changed in flight.
     """

@@ -89,7 +89,7 @@ class SourceLowPass:
     lag_s : float
         Lag of the positions at constant velocity.
     gain_nats : float
-        Log-likelihood gain of the low-pass filter over white noise.
+        Log likelihood (nats) with the low-pass filter minus log likelihood with white noise.
     sigma_z_m : float
         White position noise before the low-pass filter (1 σ).
     """
@@ -111,9 +111,10 @@ class TimeCorrelatedNoise:
     slow_m, white_m : float
         Standard deviation of time-correlated (slow) and of white noise, per axis.
     gain_nats : float
-        Log-likelihood gain over white noise.
+        Log likelihood (nats) with time-correlated noise minus log likelihood with white noise.
     low_pass_gain_nats : float
-        Log-likelihood gain of a low-pass filter over time-correlated noise.
+        Log likelihood (nats) with a low-pass filter instead, minus log likelihood with
+        time-correlated noise.
     """
 
     tau_s: float
@@ -174,9 +175,10 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     directions = np.array([axis.direction for axis in axes])
 
     def undo_low_pass(tau_s: float) -> tuple[PositionsAndImuMotion | Unavailable, float]:
-        """Undo a low-pass filter with time constant ``tau_s``.
+        """Compute the positions before a low-pass filter with time constant ``tau_s``.
 
-        Return the unfiltered positions with their IMU motion, and the change of -ln p.
+        Return the unfiltered positions with the IMU motion between them, and a term to add to their
+        negative log likelihood, so that the sum is that of the measured positions.
         """
         rho = np.zeros(len(time_s))
         if tau_s:

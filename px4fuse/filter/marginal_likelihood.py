@@ -3,9 +3,9 @@
 A segment is a part of the flight without a gap in the IMU data. Each segment has an unknown initial
 state and unknown constants (biases and other constant errors).
 
-Given the acceleration, position and velocity at the measurements are estimated by least squares.
-The normal equations Ax = b have a banded matrix A. The likelihood equals that of KF's innovations
-(Schweppe 1965).
+For given constants, position and velocity at the measurement times are estimated by least squares
+from the measured positions and the IMU acceleration. The normal equations Ax = b have a banded
+matrix A. The resulting likelihood equals the likelihood of KF's innovations (Schweppe 1965).
 
 The constants are estimated by linear regression of the data on the derivatives of the data with
 respect to each constant. The data and these derivatives are called inputs. The data consist of
@@ -243,7 +243,9 @@ class PositionFit:
         )
 
     def compute_segment_scores(self, sigma_factors: Array = UNIT_SIGMA_FACTOR) -> Array:
-        """Return -ln p of the positions in each segment, shape (factors, segments, time offsets).
+        """Return the negative log likelihood of the positions in each segment.
+
+        The shape is (factors, segments, time offsets).
 
         All σ are multiplied by each of ``sigma_factors``. A term that is equal for all time offsets
         is omitted.
@@ -269,7 +271,9 @@ class PositionFit:
         return np.asarray(0.5 * square_sum + half_log_determinant)
 
     def compute_scores(self, sigma_factors: Array = UNIT_SIGMA_FACTOR) -> Array:
-        """Return -ln p of the positions, shape (factors, time offsets), without a constant term.
+        """Return the negative log likelihood of the positions, without a constant term.
+
+        The shape is (factors, time offsets).
 
         All σ are multiplied by each of ``sigma_factors``.
         """

@@ -1,4 +1,8 @@
-"""Texts on a re-run of KF or EKF2 with one change: kind of cause, change, effect, action."""
+"""Texts of findings on the cause of an inconsistent filter.
+
+A re-run of KF or EKF2 with one change of a setting or of the data shows the cause. The texts name
+the kind of cause, the change, its effect in the re-run, and the recommended action.
+"""
 
 from collections.abc import Mapping
 

@@ -97,8 +97,9 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
             )
         sensor_text = "accelerometers and the level horizon"
     elif ekf2_bias_m_s2 is not None:
-        # A horizontal bias that was estimated from the positions is not significant: test only the
-        # vertical bias
+        # The first branch reports a significant horizontal bias that is estimated from the
+        # positions. Here, this estimate is not significant or missing. If it is not significant,
+        # test only EKF2's estimate of the vertical bias
         is_horizontal_bias_estimated = isinstance(systematic_errors, SystematicErrors)
         bias_m_s2 = float(np.linalg.norm(ekf2_bias_m_s2[2 * is_horizontal_bias_estimated :]))
         forward, right, down = ekf2_bias_m_s2

@@ -93,7 +93,7 @@ class Closure(Record, kw_only=True):
     time_2_s: float
     # σ (m), per axis, of the assumed displacement between the positions at time_1_s and time_2_s
     sigma_m: NotNegative
-    # "landing": closure of take-off and landing; "given": closure from the user
+    # "landing": loop closure between take-off and landing; "given": between two times from the user
     source: str
     # Closure error (m) of odometry
     distance_m: NotNegative

@@ -19,9 +19,11 @@ LABEL_WIDTH = 52.0  # points, of the labels beside texts
 AXES_LEFT_MARGIN = 38.0  # points, for tick labels and axis label
 AXES_RIGHT_MARGIN = 8.0  # points
 LEGEND_HEIGHT = 12.0  # points, of each line
-LEGEND_HANDLE_WIDTH = 30.0  # points, of the line or symbol of an entry, with its margins
-LEGEND_CHARACTER_WIDTH = 5.0  # points, more than the mean width in DejaVu Sans of 8 points
-TICK_SPACING = 62.0  # points, approximate minimum
+# Width (points) of the line or symbol before each label of a legend, with margins
+LEGEND_HANDLE_WIDTH = 30.0
+# Upper limit (points) of the mean character width in the legend, DejaVu Sans of 8 points
+LEGEND_CHARACTER_WIDTH = 5.0
+TICK_SPACING = 62.0  # points, approximate minimum distance of two ticks
 # Height (points) below the axes with and without tick labels and axis label
 LABELLED_BOTTOM_MARGIN, UNLABELLED_BOTTOM_MARGIN = 24.5, 3.0
 # Printed characters for which str.isprintable is False

@@ -33,7 +33,7 @@ class FaultSizes:
     clock_offset_s: float = make_bounded_field(0.0, -5.0, 5.0, "SECONDS")
     clock_drift_ppm: float = make_bounded_field(0.0, -20_000.0, 20_000.0, "PPM")
     clock_jump_s: float = make_bounded_field(0.0, 0.0, 5.0, "SECONDS")
-    # Fraction of outliers, as without line of sight
+    # Percentage of positions that are outliers, as when the line of sight is blocked (NLOS)
     nlos_percent: float = make_bounded_field(0.0, 0.0, 50.0, "PERCENT")
     # Mean error of an outlier
     nlos_size_m: float = make_bounded_field(2.0, 0.0, 100.0, "SIZE")

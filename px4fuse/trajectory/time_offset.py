@@ -43,10 +43,10 @@ MAX_FITTED_POSES = 2000
 MAX_RELATIVE_MISFIT = 0.5
 # Lower limit of residual divided by extent (RMS): better fits count as equally good
 MISFIT_FLOOR = 1e-3
-# Minimum ratio: RMS of the velocity that no change of the alignment explains ÷ RMS speed
+# Minimum ratio: RMS of the velocity without the effect of a wrong alignment ÷ RMS speed
 MIN_RESIDUAL_VELOCITY_FRACTION = 0.05
-# Minimum correlation, between both trajectories, of the velocity that no change of the alignment
-# explains
+# The effect of a wrong alignment (shift, rotation, scale) is subtracted from the velocities of both
+# trajectories. Minimum correlation between the remaining velocities
 MIN_RESIDUAL_VELOCITY_CORRELATION = 0.5
 # Maximum lag in the variance estimate of Newey and West (1987) ÷ correlation length
 MAX_LAG_IN_CORRELATION_LENGTHS = 4
@@ -143,7 +143,8 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
                     f"{best_fit.compute_residual_rms_m():.3g} m and "
                     f"{fit.compute_residual_rms_m():.3g} m"
                 )
-    # In a narrower search window, more poses overlap in time
+    # Repeat the fit in a narrower search window. A fit uses only poses that overlap with the other
+    # trajectory at all tested offsets, so the narrower window allows more poses
     best_fit = (
         _refine_offset(sparse_track, dense_track, best_fit.offset_s, FINE_SEARCH_HALF_WIDTH_S)
         or best_fit

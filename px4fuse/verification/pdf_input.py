@@ -141,7 +141,8 @@ def _check_file(pdf: bytes) -> None:
     # find decompression bombs before pypdf reads the file
     remaining_bytes = MAX_DOCUMENT_BYTES
     for stream_match in _STREAM_START_PATTERN.finditer(pdf):
-        # test each word "stream" in the file, even inside other data
+        # compressed data follow the word "stream". Each such word is tested, even inside other
+        # data; if no zlib data follow, the size is 0
         inflated_bytes = _estimate_inflated_bytes(
             pdf, stream_match.end(), min(remaining_bytes, MAX_CONTENT_BYTES)
         )

@@ -75,9 +75,10 @@ def _select_fault_kinds(draw_number: Callable[[str], float]) -> dict[str, str]:
 
 
 def select_choices(draw_number: Callable[[str], float]) -> tuple[tuple[Choice, ChoiceLetter], ...]:
-    """Make the multiple-choice questions about a student's figures, each with its right letter.
+    """Make the multiple-choice questions about a student's plots, each with its right letter.
 
-    ``draw_number`` converts a name, such as "figures fault", to a random number in [0, 1).
+    ``draw_number`` returns a random number in [0, 1) for a name. The number is always the same for
+    the same student and name, so the questions of a student do not change.
     """
     choices = []
     for title, kind in _select_fault_kinds(draw_number).items():
@@ -96,9 +97,9 @@ def select_choices(draw_number: Callable[[str], float]) -> tuple[tuple[Choice, C
 
 
 def draw_figures(draw_number: Callable[[str], float]) -> bytes:
-    """Simulate and plot the flights of a student's figures; return one PNG file.
+    """Simulate and plot the flights for a student's multiple-choice questions; return one PNG file.
 
-    ``draw_number`` converts a name to a random number in [0, 1).
+    ``draw_number`` is as in :func:`select_choices`.
     """
     comparisons = {}
     for title, kind in _select_fault_kinds(draw_number).items():

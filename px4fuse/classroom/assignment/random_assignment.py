@@ -45,8 +45,8 @@ DIFFICULT_FAULTS_PROBABILITY, MAX_FAULT_DIFFICULTY = 0.25, 1.5
 class AssignableFault(Record):
     """Type of fault that can be injected into a student's flight (``assignable_faults.csv``).
 
-    IMU gaps are not assigned: in half of the flights, the analysis reports a changed time offset
-    instead.
+    IMU gaps are not assigned: in half of the flights with an IMU gap, px4fuse reports a change of
+    the time offset instead of the gap.
 
     Attributes
     ----------
@@ -63,9 +63,10 @@ class AssignableFault(Record):
         Range of the start of the fault; 0 for a fault of the whole flight.
     masked_fault_groups : str
         Groups, separated by blanks, of faults that px4fuse cannot detect in a flight with this
-        fault. Reasons: the estimates of time offset and yaw need the IMU at full rate; outliers
-        increase rejections and NIS, and change the yaw estimate; a wrong delay is detected by
-        rejected good samples.
+        fault. Examples: a reduced IMU rate masks the groups "clock" and "frame", because the
+        estimates of time offset and yaw need the IMU at full rate. Outliers mask the group "frame",
+        because they change the yaw estimate. A too small noise or gate of EKF2 masks the group
+        "outliers", because both increase the number of rejected positions.
     """
 
     flight_kind: ScenarioKind

@@ -50,9 +50,10 @@ class RubricItem(Record, kw_only=True, tag_field="check"):
     points : float
         Maximum points.
     report : {"any", "compare", "loop"}
-        Command whose reports the instructor wants to score.
+        px4fuse command whose reports are scored; chosen by the instructor.
     command : {"any", "compare", "loop"}
-        Command whose reports contain the required data.
+        px4fuse command whose reports contain the data that the check needs; fixed for each type of
+        check.
     """
 
     command: ClassVar[str] = "any"
@@ -74,9 +75,10 @@ class RubricItem(Record, kw_only=True, tag_field="check"):
 
 
 def compute_points_fraction(deviation_factor: float, factor_at_zero_score: float) -> float:
-    """Return the fraction of the maximum points for a value with a wrong factor.
+    """Return the fraction of the maximum points for a value that is too large or small by a factor.
 
-    The fraction is 1 - ln(deviation_factor) / ln(factor_at_zero_score), between 0 and 1.
+    The fraction decreases with the logarithm of ``deviation_factor``, from 1 for the right value
+    (factor 1) to 0 at ``factor_at_zero_score``.
 
     >>> [round(compute_points_fraction(deviation, 4.0), 2) for deviation in (1.0, 2.0, 4.0, 9.0)]
     [1.0, 0.5, 0.0, 0.0]
@@ -458,9 +460,10 @@ CORRECTED_PATH_NAMES: tuple[CorrectionName, ...] = (
 class LoopItem(RubricItem, tag="loop"):
     """Score the analysis of a loop.
 
-    - 1/4 of the points for a loop closure error.
-    - 1/2 of the points for an accepted loop closure.
-    - All points for a corrected path.
+    - 1/4 of the points if the report states the loop closure error.
+    - 1/2 of the points if a loop closure was also accepted.
+    - All points if the path was also corrected. If the vehicle did not land at the take-off
+      position, all points if no loop closure was accepted.
     """
 
     def score(self, scoring_input: ScoringInput) -> ScoreAndReason:

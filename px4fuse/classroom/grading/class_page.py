@@ -235,12 +235,13 @@ def _make_points_input_boxes(grade: Grade) -> RowDetailsSection:
 
 @dataclass(frozen=True)
 class ItemStatistics:
-    """Points of all reports for one rubric item, one part of the answer form, or one fault.
+    """Statistics of a class for one rubric item, one part of the answer form, or one fault.
 
     Attributes
     ----------
     discrimination : float or None
-        Correlation between the points for this item and for all other items.
+        Correlation between the points for this item and the points for the other items. None if
+        there are too few reports, or if all reports have the same points.
     """
 
     title: str
@@ -250,7 +251,11 @@ class ItemStatistics:
 
 
 def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
-    """Compute points and discrimination of each rubric item, part of the answer form, and fault."""
+    """Compute the statistics of all graded reports, for three kinds of items.
+
+    The items are those of the rubric, the parts of the answer form, and the injected faults. A
+    fault gives one point if the student named it.
+    """
     item_scores, form_scores, fault_scores = (
         defaultdict[str, list[tuple[float, float, float]]](list) for _ in range(3)
     )

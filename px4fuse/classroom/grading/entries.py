@@ -247,7 +247,10 @@ def _make_candidate(
     student_index: int | None,
     class_list: ClassList,
 ) -> _Candidate:
-    """Return a report, its time, and the grade of the student if this report counts."""
+    """Return a report with its submission time, and the grade that it gives to the student.
+
+    The grade applies only if the report is chosen from all reports of the student.
+    """
     origin, platform = submission.origin, submission.origin.platform.capitalize()
     person = (
         Person(report.student_id) if student_index is None else class_list.people[student_index]

@@ -54,17 +54,19 @@ MAX_RELATIVE_SIZE_ERROR_FOR_HALF_POINTS = 0.4
 
 
 class CorrectionRule(Record):
-    """Correction of a fault that gives points (row of ``corrections.csv``).
+    """Answer of a student that gives points as correction of a fault (row of ``corrections.csv``).
 
-    The best correction of a fault is first.
+    For each fault, the first row is the best correction.
 
     Attributes
     ----------
+    parameter : str
+        Changed option, EKF2 parameter, or other action.
     fault_kinds : str
         Faults, separated by blanks.
     score : float
-        Fraction of the points: 1 for a correction, 1/2 if the parameter does not correct the
-        fault, and 1/3 if it hides the fault.
+        Fraction of the points: 1 if the parameter corrects the fault, 1/2 if it concerns the fault
+        but does not correct it, and 1/3 if it only hides the fault.
     right_values : str
         "LOW to HIGH", or the name of a computed range; "" if any value is right.
     """

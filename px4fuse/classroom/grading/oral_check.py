@@ -33,7 +33,11 @@ def format_questions(grades: Sequence[Grade], key: AnswerKey, count: int) -> str
 def ask_about_form(
     answers: Answers, right_answers: CorrectFormAnswers
 ) -> Iterator[QuestionAndAnswer]:
-    """Yield questions about the faults and figures in a student's answers, wrong answers first."""
+    """Yield questions for an oral exam about a student's answer form, with the expected answers.
+
+    Order: faults that the student named but the flight does not have, injected faults, and
+    multiple-choice questions on plots (wrong answers first).
+    """
     kinds_named_by_student = [fault.kind for fault in answers.mistakes]
     injected_fault_kinds = [fault.kind for fault in right_answers.mistakes]
     for kind in kinds_named_by_student:

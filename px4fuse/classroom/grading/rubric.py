@@ -379,7 +379,10 @@ def _count_equal_numbers(form: Answers, other_form: Answers) -> int:
 
 
 def _is_same_number(answer: NumericAnswer, other_answer: NumericAnswer) -> bool:
-    """Return True for equal lists, and for nearly equal numbers with more than one digit."""
+    """Return True if two answers are so similar that one may be copied from the other.
+
+    Numbers with one significant digit do not count, because they are often equal by chance.
+    """
     if isinstance(answer, float) and isinstance(other_answer, float):
         has_one_digit = answer == float(f"{answer:.0e}")
         return not has_one_digit and math.isclose(

@@ -1,7 +1,10 @@
 """Search for submitted PDFs in folders and in zip files that learning platforms export.
 
-Zip files are not unpacked to disk, and the names in them are never used as paths. Students choose
-the end of a path, so the first name that matches a pattern identifies the student.
+Zip files are not unpacked to disk, and the names in them are never used as paths.
+
+The learning platform writes the student's name to the beginning of a path. The student chooses the
+file name at its end, and could imitate there the name of another student. Therefore the first match
+of a pattern identifies the student.
 
 Sources of the patterns:
 

@@ -71,7 +71,10 @@ class NormalEquations:
         element_starts = np.append(0, np.cumsum(row_counts * unknowns_per_pose * column_counts))
 
         def find_rows(group: IntArray, pose_index: IntArray) -> IntArray:
-            """Return the d rows of each of n poses in the frontal matrix of its ``group``."""
+            """Return the rows of each pose in the frontal matrix of its group.
+
+            The shape is (n, d) for n poses with d unknowns each.
+            """
             row = np.searchsorted(keys_of_group_and_row, group * len(poses) + pose_index)
             return np.asarray(
                 (row - row_starts[group])[:, None] * unknowns_per_pose + offsets_in_pose
@@ -211,8 +214,8 @@ def _find_elimination_order(
         # This elimination order gives fewer nonzeros than the default COLAMD
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.0,
-        # SuperLU must not merge columns with different nonzeros (relaxed supernodes): it would then
-        # store zeros
+        # By default, SuperLU merges columns with different nonzeros (relaxed supernodes), and then
+        # stores zeros. This is switched off, because the code below counts the stored elements
         relax=1,
         options={"SymmetricMode": True},
     )
