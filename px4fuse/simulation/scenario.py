@@ -31,7 +31,8 @@ class Bounds:
     """Limits, unit and option of a number on the command line.
 
     ``help_or_placeholder`` is the help text if the number is the value of an option. If the number
-    is the size of a simulated fault, it is the placeholder in the syntax, such as SECONDS. :func:`collect_field_bounds` sets ``unit`` and ``option``.
+    is the size of a simulated fault, it is the placeholder in the syntax, such as SECONDS.
+    :func:`collect_field_bounds` sets ``unit`` and ``option``.
     """
 
     low: float
