@@ -253,7 +253,7 @@ def score_fault_kind(kind: str, named_kind: str) -> float:
 def _score_faults(matches: list[FaultMatch], right_answers: CorrectFormAnswers) -> dict[str, float]:
     """Return the mean score of all injected faults, by part of the answer form."""
     faults_with_size_count = sum(fault.size is not None for fault, _, _ in matches)
-    scores = dict.fromkeys(("mistakes", "sizes", "fault time and panel", "correction"), 0.0)
+    scores = dict.fromkeys(("mistakes", "sizes", "fault time and plot", "correction"), 0.0)
     for fault, named_fault, score in matches:
         if named_fault is None:
             continue
@@ -261,7 +261,7 @@ def _score_faults(matches: list[FaultMatch], right_answers: CorrectFormAnswers) 
         fault_weight = (size_score if fault.kind in GUESSABLE_FAULT_KINDS else 1.0) / len(matches)
         evidence_weight = fault_weight if named_fault.kind == fault.kind else 0.5 * fault_weight
         scores["mistakes"] += score / len(matches)
-        scores["fault time and panel"] += score_evidence(fault, named_fault) * evidence_weight
+        scores["fault time and plot"] += score_evidence(fault, named_fault) * evidence_weight
         scores["correction"] += score_correction(fault, named_fault, right_answers) * fault_weight
         scores["sizes"] += size_score / max(faults_with_size_count, 1)
     return scores
