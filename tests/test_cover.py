@@ -79,7 +79,7 @@ def test_report_cover_numbers_alternative_actions() -> None:
     text = text_of(replace(SMALL_SIGMA_A, causes=(cause,)))
     assert "option 1: sender subtract 0.264 s" in text
     assert "option 2: EKF2 console param set EKF2_EV_DELAY 264 reboot" in text
-    assert "also: KF keep the settings" in text
+    assert "in addition: KF keep the settings" in text
     assert "console: MAVLink Console of QGroundControl" in text
 
 
