@@ -237,8 +237,9 @@ class FormQuestion(Record):
             "nis": f"NIS in update {update}",
             "prediction": f"position sigma of KF (m) {number_text} s after update {update}, "
             "without further updates",
-            "gate": f"update numbers ({update} to {update + GATE_QUESTION_FURTHER_UPDATES}) with "
-            f"innovations outside ±{number_text} sqrt(S), if KF rejects no measurement",
+            "gate": f"numbers of all updates from {update} to "
+            f"{update + GATE_QUESTION_FURTHER_UPDATES} with an innovation outside ±{number_text} "
+            "sqrt(S), if KF has no gate",
         }[self.kind]
         return f"{quantity}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
 
