@@ -35,7 +35,7 @@ def run_aisle_example() -> KfRun:
         measurement_time_s=time_s,
         # The initial position is known
         measurement_m=TRUE_VELOCITY_M_S * time_s + np.array([0.0, *UWB_ERRORS_M]),
-        acceleration=Unavailable("acceleration", "Example 1 contains no acceleration", ""),
+        acceleration=Unavailable("acceleration", "the lesson example contains no IMU data", ""),
     )
     return run_kf(axis, settings)
 

@@ -60,11 +60,11 @@ def test_diagnosis_text_numbers_alternative_actions() -> None:
     cause = replace(SMALL_SIGMA_A.causes[0], alternatives=((SENDER,), (DELAY,)))
     card = replace(SMALL_SIGMA_A, causes=(cause,))
     lines = text_of(card)
-    (first,) = (at for at, line in enumerate(lines) if line.startswith("  option 1: sender  "))
+    (first,) = (at for at, line in enumerate(lines) if line.startswith("  option 1: sender   "))
     assert SENDER.sentence in lines[first]
-    assert lines[first + 1].startswith("  option 2: EKF2    set in the MAVLink Console")
+    assert lines[first + 1].startswith("  option 2: EKF2     set in the MAVLink Console")
     assert lines[first + 2].split() == ["param", "set", "EKF2_EV_DELAY", "264"]
-    assert lines[first + 3].startswith("  also: KF          run again: px4fuse compare ")
+    assert lines[first + 3].startswith("  in addition: KF    run again: px4fuse compare ")
     (explanation,) = (line.text for line in card_text.format_closing_lines(card))
     assert explanation.endswith(f"px4fuse explain {card.id}")
 

@@ -80,7 +80,7 @@ def test_report_cover_numbers_alternative_actions() -> None:
     assert "option 1: sender subtract 0.264 s" in text
     place = "set in the MAVLink Console of QGroundControl:"
     assert f"option 2: EKF2 {place} param set EKF2_EV_DELAY 264 reboot" in text
-    assert "also: KF keep the settings" in text
+    assert "in addition: KF keep the settings" in text
 
 
 def test_report_cover_shows_3_notes_and_counts_the_others() -> None:

@@ -191,7 +191,7 @@ def test_submission_named_like_a_platform_export_is_flagged() -> None:
     (ada, _), _ = make_grades({name: graded_report("", 4.0)})
     assert ada.submission_time == "2026-11-20 10:00"
     assert ada.flags == (
-        "The student's file name imitates the upload name of a learning platform. "
+        "The student chose a file name that only learning platforms give. "
         "Check who handed in the file.",
     )
 

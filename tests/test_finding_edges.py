@@ -383,7 +383,7 @@ def test_frame_is_misaligned_if_alignment_halves_position_rmse(
     assert (finding.id == "source_drift") is (drifts and not frame)
     if finding.id == "source_drift":
         assert finding.message.startswith(
-            "VIO drifts: horizontal position RMSE 1.00 m before and 0.55 m after the best shift"
+            "VIO drifts: horizontal position RMSE 1.00 m before and 0.55 m after alignment (shift"
         )
     assert (finding.remedy == hidden_errors.FRAME_REMEDY) is frame
 

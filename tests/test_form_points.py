@@ -137,19 +137,19 @@ def test_feedback_reports_each_right_answer_that_was_not_given() -> None:
 
 DELAY = {"parameter": "EKF2_EV_DELAY", "value": 200.0, "value_unit": "ms"}
 GATE = {"parameter": "EKF2_EVP_GATE", "value": 3.0, "value_unit": "sd"}
-NO_FAULTS = {"mistakes": 0.0, "sizes": 0.0, "fault time and panel": 0.0, "correction": 0.0}
+NO_FAULTS = {"mistakes": 0.0, "sizes": 0.0, "fault time and plot": 0.0, "correction": 0.0}
 # A form, and its parts with reduced points
 HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
     # wrong sign: a third of the points for the size and the action of this fault
     (with_claim(size=-190.0, value=0.2), {"sizes": 10.0, "correction": 10.0}),
     (with_claim(size=140.0), {"sizes": 11.25}),
     (with_claim(size=900.0, value=-0.9), {"sizes": 7.5, "correction": 11.25}),
-    (with_claim(panel="map"), {"fault time and panel": 7.5}),
-    (with_claim(when=""), {"fault time and panel": 7.5}),
+    (with_claim(panel="map"), {"fault time and plot": 7.5}),
+    (with_claim(when=""), {"fault time and plot": 7.5}),
     (with_claim(**DELAY), {}),
     (with_claim(**GATE), {"correction": 7.5}),
     # similar fault: 0.4 of the kind, a third of the size, half of the time
-    (with_claim(kind="ekf2-delay"), {"mistakes": 21.0, "sizes": 10.0, "fault time and panel": 7.5}),
+    (with_claim(kind="ekf2-delay"), {"mistakes": 21.0, "sizes": 10.0, "fault time and plot": 7.5}),
     # each wrong fault costs 10 points
     (with_false("yaw"), {"mistakes": 20.0}),
     (with_false("yaw", "nlos", "scale"), NO_FAULTS),

@@ -108,7 +108,7 @@ def format_differences(results: ChangeResults) -> Page:
     for text in results.worse:
         page.write_labelled("Worse", styled_text(text, ERROR_COLOUR))
     if not results.worse:
-        page.write("Compared with A, B has no additional inconsistent filter or error finding.")
+        page.write("B contains no inconsistent filter and no error that A does not contain.")
     return page
 
 

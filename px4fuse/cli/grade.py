@@ -47,7 +47,7 @@ from px4fuse.errors import OutputError, SettingsError
     "--attempt",
     type=Choice(("latest", "best", "first")),
     default="latest",
-    help="Graded attempt of a student with several reports.",
+    help="Report to grade if a student handed in several.",
 )
 @click.option(
     "--due",

@@ -313,7 +313,7 @@ filter_options = _combine_options(
     ),
     _comparison_option(
         "axes",
-        "Axis to analyse, repeatable; aisle is the main axis of the track.  [default: all axes "
+        "Axis to analyse, repeatable; aisle is the axis of largest motion.  [default: all axes "
         "with a position; for GNSS the horizontal axes]",
         multiple=True,
     ),
@@ -332,8 +332,8 @@ filter_options = _combine_options(
     ),
     _comparison_option(
         "position_source",
-        "Position source for KF; px4fuse info lists all sources.  [default: the least processed "
-        "of the logged sources]",
+        "Position source for KF; px4fuse info lists all sources.  [default: positions as "
+        "received by PX4, if logged]",
         metavar="NAME",
     ),
     _comparison_option(

@@ -32,7 +32,7 @@ def sample_log() -> Path:
         except ModuleNotFoundError:
             raise MissingDataError(
                 "No log was given, and the sample logs are not installed.",
-                f"Give the path of a log, or run {INSTALL_COMMAND}.",
+                f"Give the path of a log, or install the sample logs: {INSTALL_COMMAND}",
             ) from None
     click.echo(f"No log was given: the sample log {SAMPLE_LOG} is used.", err=True)
     return path

@@ -199,19 +199,14 @@ def _describe_replacement_effect(
     replacement: PropertyReplacement, explanation: DifferenceExplanation
 ) -> str:
     explained_fraction = replacement.position_mean_square_m2 / explanation.position_mean_square_m2
-    change_text = (
+    effect_text = (
         f"If KF uses EKF2's {replacement.name}, KF's position changes by up to "
-        f"{replacement.position_moved_m:.2f} m (at {replacement.moved_at_s:.1f} s)"
+        f"{replacement.position_moved_m:.2f} m (at {replacement.moved_at_s:.1f} s), and the mean "
+        f"square difference KF - EKF2 decreases by {100 * explained_fraction:.0f} %."
     )
     if explained_fraction > 1.0:
-        return (
-            f"{change_text}. This change explains {explained_fraction:.2g} times the mean square "
-            "difference KF - EKF2. Other replaced properties increase the difference."
-        )
-    return (
-        f"{change_text}, and the mean square difference KF - EKF2 decreases by "
-        f"{100 * explained_fraction:.0f} %."
-    )
+        effect_text += " Other replaced properties increase the difference."
+    return effect_text
 
 
 def _describe_rejections(explanation: DifferenceExplanation) -> str:

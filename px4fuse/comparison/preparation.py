@@ -314,7 +314,7 @@ def _explain_choice(track: PositionTrack) -> str:
         return "the user gave this position file with --position"
     if track.origin.is_fused_as_gnss:
         return "the only position source in the log, fused by EKF2"
-    return f"source chosen automatically; position origin: {track.origin.route}"
+    return "source chosen automatically"
 
 
 def shift_timestamps(track: PositionTrack, clock_offset_s: float) -> PositionTrack:

@@ -42,8 +42,8 @@ MIN_NEES_FOR_ERROR = 16.0
 # If KF's position RMSE ÷ EKF2's position RMSE is below this ratio, the fault is in EKF2 and not in
 # the positions, which both filters use
 MAX_KF_TO_EKF2_RMSE_RATIO = 0.7
-# The position frame is misaligned if the best shift and rotation reduces the position RMSE to less
-# than this fraction
+# The position frame is misaligned if alignment (shift and rotation) reduces the position RMSE to
+# less than this fraction
 MAX_ALIGNED_RMSE_RATIO = 0.5
 DRIFT_REMEDY = "In the next flight, send an absolute position (GNSS, UWB) as well."
 LOOP_REMEDY = "To correct the path of this flight by a loop closure, run px4fuse loop LOG."
@@ -127,7 +127,7 @@ def make_hidden_error_finding(
         before_m, after_m = alignment_rmse
         rmse_text = (
             f"horizontal position RMSE {format_metres(before_m)} m before and "
-            f"{format_metres(after_m)} m after the best shift and rotation"
+            f"{format_metres(after_m)} m after alignment (shift and rotation)"
         )
         evidence |= {
             "position_rmse_horizontal_m": before_m,

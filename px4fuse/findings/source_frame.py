@@ -125,7 +125,7 @@ def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Find
 def _explain_gnss_heading_error(analysis: Analysis) -> tuple[str, str]:
     """Return the possible cause of a wrong heading in a flight with GNSS, and the action."""
     if (rerun := find_confirmed_noise_rerun(analysis)) is not None:
-        cause = f"a wrong {find_aid(analysis).noise} (GNSS also corrects EKF2's heading)"
+        cause = f"a wrong {find_aid(analysis).noise}, which also changes EKF2's heading"
         return cause, f"Set {format_changes(rerun.change)}. Then check the heading again."
     advice = magnetometer_advice(analysis.flight)
     cause = (

@@ -110,7 +110,7 @@ def find_source_origin(kind: str, route: str) -> SourceOrigin:
     for origin in SOURCE_ORIGINS:
         if (origin.kind, origin.route) == (kind, route):
             return origin
-    raise ValueError(f"no position source has the kind {kind!r} and the route {route!r}")
+    raise ValueError(f"no position source of kind {kind!r} is available {route!r}")
 
 
 REPEATED_TIMESTAMPS_NOTE = (

@@ -288,7 +288,7 @@ def _list_analyses(
         yield AnalysisOption(
             "compare",
             True,
-            f"KF with {sample_count} samples of position source {source.name} from "
+            f"KF from {sample_count} samples of position source {source.name}, "
             f"{segment.start_s:.1f} s to {segment.end_s:.1f} s",
         )
     low_rate_findings = () if flight.log.is_assessed else imu.detect_low_rates(flight)

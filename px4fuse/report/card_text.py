@@ -300,13 +300,15 @@ def _format_cause_lines(cause: DiagnosedCause, do_this: str) -> Iterator[Paragra
 
 
 def label_alternatives(cause: DiagnosedCause) -> list[tuple[str, Action]]:
-    """Return the actions of a cause with "option 1: ", "also: " and so on if there are options."""
+    """Return the actions of a cause, with "option 1: " or "in addition: " if there are options."""
     alternatives = [
         (f"option {place}: ", action)
         for place, alternative in enumerate(cause.alternatives, start=1)
         for action in alternative
     ]
-    return alternatives + [("also: " if alternatives else "", action) for action in cause.actions]
+    return alternatives + [
+        ("in addition: " if alternatives else "", action) for action in cause.actions
+    ]
 
 
 def _format_action_lines(label: str, label_width: int, action: Action) -> Iterator[Paragraph]:

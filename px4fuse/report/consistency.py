@@ -116,8 +116,8 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     page.add_table(column_heads, rows, right_aligned_columns=(3, 4))
     page.write_muted_text(
         "Each row is a re-run with one change. 'explains': relative reduction of ln(mean NIS) or "
-        "ln(mean NEES); 'all': the filter becomes consistent. A change that explains 50 % or more "
-        "is a cause."
+        "ln(mean NEES), which is 0 for a consistent filter; 'all': the filter becomes consistent. "
+        "A change that explains 50 % or more is a cause."
     )
 
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from px4fuse.core.text import format_count, join_first_names
 from px4fuse.flight.model import Unavailable
 from px4fuse.info.inventory import Inventory, LoggedData
+from px4fuse.readers.px4_topics import RECONSTRUCTED_TRACK_NAME
 from px4fuse.report.page import Cell, Page
 from px4fuse.report.phrases import format_clock_map
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
@@ -95,9 +96,10 @@ def _describe_log(inventory: Inventory) -> Iterator[tuple[str, str]]:
 
 def _make_source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
     for source in inventory.sources:
+        note = " (computed)" * (source.name == RECONSTRUCTED_TRACK_NAME)
         yield (
             f"{source.part} (used)" if source.chosen else source.part,
-            ("none", MUTED_COLOUR) if source.unavailable else source.name,
+            ("none", MUTED_COLOUR) if source.unavailable else f"{source.name}{note}",
             "" if source.samples is None else format_count(source.samples, "sample"),
             "" if source.rate_hz is None else f"{_format_for_narrow_column(source.rate_hz)} Hz",
             _format_gaps(source),

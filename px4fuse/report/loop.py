@@ -199,7 +199,7 @@ def write_closures_and_rpe(page: Page, loop: Loop) -> None:
                 f"{error.delta_text}: {_format_error(error.translation_m, error.interval_m)}"
                 for error in score.rpe
             ]
-            rotation_text = f"rotation {format_rmse(score.ate.rotation_deg, 2)}°"
+            rotation_text = f"ATE rotation RMSE {format_rmse(score.ate.rotation_deg, 2)}°"
             rpe_rows.append([f"RPE, {path.name}", *rpe_texts, rotation_text])
         if rpe_rows:
             page.add_table(head, rpe_rows)

@@ -23,8 +23,8 @@ TUNING_HEAD = (
     "lag-1 autocorrelation",
 )
 TUNING_NOTE = (
-    "Log-likelihood gain in nats per measurement; on 2nd half: with the estimates of the 1st half. "
-    "Autocorrelation of the innovations before → after tuning."
+    "Log-likelihood gain in nats per measurement; on 2nd half of the flight: gain of the noise "
+    "estimated from the 1st half. Autocorrelation of the innovations before → after tuning."
 )
 
 

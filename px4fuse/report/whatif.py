@@ -28,10 +28,10 @@ def make_column_headings(analysis: WhatIfAnalysis) -> list[str]:
     change_texts += [
         f"without {name} from {start_s:g} s" for name, start_s in analysis.without.items()
     ]
-    headings = ["logged", "replayed"]
+    headings = ["logged", "replayed as flown"]
     if change_texts:
         estimate_note = " (maximum-likelihood estimate)" if analysis.uses_estimates else ""
-        headings.append(f"changed: {', '.join(change_texts)}{estimate_note}")
+        headings.append(f"replayed, changed: {', '.join(change_texts)}{estimate_note}")
     return headings
 
 
@@ -170,7 +170,7 @@ def make_whatif_page(analysis: WhatIfAnalysis) -> Page:
     spans_text = ", ".join(
         f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.evaluated_s
     )
-    page.write_labelled("Segment", f"{spans_text}, for all statistics")
+    page.write_labelled("Segment", f"all statistics are from {spans_text}")
     page.write_labelled("Replay", format_replay_agreement(whatif_result.agreement))
     if analysis.uses_estimates and not analysis.changes:
         no_change_text = (

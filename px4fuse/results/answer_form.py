@@ -32,14 +32,14 @@ EMPTY_CELL = "\u2013"
 class AllowedAnswers(Record):
     """Allowed answers to the questions of the answer form (``form.toml``)."""
 
-    behaviours: str
-    report_panels: str
+    behaviours: tuple[str, ...]
+    report_panels: tuple[str, ...]
     units: dict[str, dict[str, float]]
 
 
 _ALLOWED_ANSWERS = read_toml(__file__, AllowedAnswers, "form.toml")
-EKF2_BEHAVIOURS = _ALLOWED_ANSWERS.behaviours.splitlines()
-REPORT_PANELS = _ALLOWED_ANSWERS.report_panels.splitlines()
+EKF2_BEHAVIOURS = _ALLOWED_ANSWERS.behaviours
+REPORT_PANELS = _ALLOWED_ANSWERS.report_panels
 
 
 def _find_units(quantity: str) -> Mapping[str, float]:
@@ -237,8 +237,9 @@ class FormQuestion(Record):
             "nis": f"NIS in update {update}",
             "prediction": f"position sigma of KF (m) {number_text} s after update {update}, "
             "without further updates",
-            "gate": f"update numbers ({update} to {update + GATE_QUESTION_FURTHER_UPDATES}) with "
-            f"innovations outside ±{number_text} sqrt(S), if KF rejects no measurement",
+            "gate": f"numbers of all updates from {update} to "
+            f"{update + GATE_QUESTION_FURTHER_UPDATES} with an innovation outside ±{number_text} "
+            "sqrt(S), if KF has no gate",
         }[self.kind]
         return f"{quantity}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
 

@@ -103,7 +103,10 @@ class Scenario:
     )
     speed_m_s: float = make_bounded_field(1.0, 0.1, 10.0, "Speed on straight segments.")
     heading_deg: float = make_bounded_field(
-        30.0, -360.0, 360.0, "Heading of the aisle or of the first side, clockwise from north."
+        30.0,
+        -360.0,
+        360.0,
+        "Heading of the aisle, or of the first side of the loop, clockwise from north.",
     )
     altitude_m: float = 1.5
     yaw: YawMode | None = None

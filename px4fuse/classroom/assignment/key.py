@@ -52,7 +52,7 @@ MIN_RESET_M = 0.2
 # Time (s) at the start in which position resets are ignored: EKF2 resets to its first position
 INITIAL_TIME_WITHOUT_RESETS_S = 5.0
 # Faults for which a student must ("required") or may ("allowed") report a behaviour of EKF2
-EKF2_BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, str]], "did.toml")
+EKF2_BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, tuple[str, ...]]], "did.toml")
 # Maximum size (bytes) of an answer key: the key of 1000 students has 2 million bytes
 MAX_KEY_BYTES = 20_000_000
 ANSWER_KEY_NOTE = (
@@ -301,7 +301,7 @@ def _find_ekf2_behaviours(
         [
             behaviour
             for behaviour, kinds in EKF2_BEHAVIOUR_RULES[rule].items()
-            if not size_by_kind.keys().isdisjoint(kinds.split())
+            if not size_by_kind.keys().isdisjoint(kinds)
         ]
         for rule in ("required", "allowed")
     )

@@ -276,8 +276,8 @@ def _make_candidate(
         )
     if origin.has_forged_platform_name:
         flags.append(
-            "The student's file name imitates the upload name of a learning platform. "
-            "Check who handed in the file."
+            "The student chose a file name that only learning platforms give. Check who handed in "
+            "the file."
         )
     reported_student_index = (
         class_list.find_student_index(Person(report.student_id)) if platform else None

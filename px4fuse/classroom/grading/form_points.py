@@ -79,7 +79,7 @@ class CorrectionRule(Record):
 
 CORRECTION_RULES = read_csv(__file__, CorrectionRule, "corrections.csv")
 POINTS_CONFIG = read_toml(__file__, dict)
-SIMILAR_FAULT_GROUPS = [set(kinds.split()) for kinds in POINTS_CONFIG["neighbours"].values()]
+SIMILAR_FAULT_GROUPS = [set(kinds) for kinds in POINTS_CONFIG["neighbours"].values()]
 FORM_PART_NAMES = tuple(POINTS_CONFIG["weights"])
 
 
@@ -248,14 +248,14 @@ def score_fault_kind(kind: str, named_kind: str) -> float:
         return SCORE_FOR_WRONG_NOISE_PARAMETER
     if any({kind, named_kind} <= group for group in SIMILAR_FAULT_GROUPS):
         return SCORE_FOR_SIMILAR_FAULT
-    is_consequence = named_kind in POINTS_CONFIG["effects"].get(kind, "").split()
+    is_consequence = named_kind in POINTS_CONFIG["effects"].get(kind, ())
     return SCORE_FOR_NAMED_CONSEQUENCE if is_consequence else 0.0
 
 
 def _score_faults(matches: list[FaultMatch], right_answers: CorrectFormAnswers) -> dict[str, float]:
     """Return the mean score of all injected faults, by part of the answer form."""
     faults_with_size_count = sum(fault.size is not None for fault, _, _ in matches)
-    scores = dict.fromkeys(("mistakes", "sizes", "fault time and panel", "correction"), 0.0)
+    scores = dict.fromkeys(("mistakes", "sizes", "fault time and plot", "correction"), 0.0)
     for fault, named_fault, score in matches:
         if named_fault is None:
             continue
@@ -263,7 +263,7 @@ def _score_faults(matches: list[FaultMatch], right_answers: CorrectFormAnswers) 
         fault_weight = (size_score if fault.kind in GUESSABLE_FAULT_KINDS else 1.0) / len(matches)
         evidence_weight = fault_weight if named_fault.kind == fault.kind else 0.5 * fault_weight
         scores["mistakes"] += score / len(matches)
-        scores["fault time and panel"] += score_evidence(fault, named_fault) * evidence_weight
+        scores["fault time and plot"] += score_evidence(fault, named_fault) * evidence_weight
         scores["correction"] += score_correction(fault, named_fault, right_answers) * fault_weight
         scores["sizes"] += size_score / max(faults_with_size_count, 1)
     return scores
@@ -307,7 +307,7 @@ def score_evidence(fault: InjectedFault, named_fault: NamedFault) -> float:
 
 def find_panels_showing_fault(fault_kind: str) -> list[str]:
     return [
-        *(panel for panel, kinds in POINTS_CONFIG["shows"].items() if fault_kind in kinds.split()),
+        *(panel for panel, kinds in POINTS_CONFIG["shows"].items() if fault_kind in kinds),
         "cover",
     ]
 

@@ -241,7 +241,7 @@ def anonymise_grade(grade: Grade, pseudonym: str) -> Grade:
         deducted_points=grade.deducted_points,
         total=grade.total,
         max_points=grade.max_points,
-        flags=("This report is flagged. The reasons are in class.csv.",) * bool(grade.flags),
+        flags=("Check this report. The reasons are in class.csv.",) * bool(grade.flags),
     )
 
 

@@ -238,7 +238,7 @@ def _find_problems(
     if scoring_input.has_form_of_other_log:
         yield "pending", FORM_MISMATCH_REASON, FORM_MISMATCH_ADVICE
     if scoring_input.key is not None and getattr(scoring_input.results.request, "position", None):
-        action = "Ask where the position file is from: the assignment contains no position file."
+        action = "Ask for the origin of the position file: students are given a log only."
         yield "pending", "", action
 
 
