@@ -149,10 +149,10 @@ def write_loop(page: Page, loop: Loop) -> None:
         correction_text = "–"
         if path.correction_max_m:
             correction_text = (
-                f"correction {path.correction_rms_m:.2f} m RMS, {path.correction_max_m:.2f} m max"
+                f"{path.correction_rms_m:.2f} m RMS, {path.correction_max_m:.2f} m maximum"
             )
         ate_texts = [
-            f"ATE {_format_error(evaluation.ate.translation_m, evaluation.ate.interval_m)}"
+            _format_error(evaluation.ate.translation_m, evaluation.ate.interval_m)
             if isinstance(evaluation := path.scores[reference_name], Evaluation)
             else "–"
             for reference_name in reference_names
@@ -172,17 +172,17 @@ def write_closures_and_rpe(page: Page, loop: Loop) -> None:
     for closure in loop.closures:
         cells = [
             _format_closure_times(closure, loop),
-            f"closure error {closure.distance_m:.2f} m,",
-            f"d² {closure.d2:.1f},",
-            f"{closure.degrees_of_freedom} degrees of freedom,",
-            f"{format_p_value(closure.p)},",
+            f"{closure.distance_m:.2f} m",
+            f"{closure.d2:.1f}",
+            f"{closure.degrees_of_freedom}",
+            format_p_value(closure.p).removeprefix("p "),
             "accepted" if closure.accepted else "REJECTED",
-            "" if closure.weight_gnc is None else f"GNC weight {closure.weight_gnc:.2f}",
+            "–" if closure.weight_gnc is None else f"{closure.weight_gnc:.2f}",
         ]
         colour = TEXT_COLOUR if closure.accepted else ERROR_COLOUR
         rows.append([(cell, colour) for cell in cells])
     if rows:
-        head = ["loop closure", *[""] * 6]
+        head = ["loop closure", "error", "d²", "degrees of freedom", "p", "gate", "GNC weight"]
         page.add_table(head, rows, right_aligned_columns=(1, 2, 3, 4, 6))
     for reference in loop.references:
         page.write_heading(f"RPE against {reference.name}")
@@ -193,14 +193,12 @@ def write_closures_and_rpe(page: Page, loop: Loop) -> None:
                 notes[score.reason] = None
                 continue
             if not rpe_rows:
-                head = ["path", *[""] * (len(score.rpe) + 1)]
+                head = ["path", *(error.delta_text for error in score.rpe), "ATE rotation RMSE"]
                 notes |= dict.fromkeys((describe_method(score), *score.notes, *score.warnings))
             rpe_texts = [
-                f"{error.delta_text}: {_format_error(error.translation_m, error.interval_m)}"
-                for error in score.rpe
+                _format_error(error.translation_m, error.interval_m) for error in score.rpe
             ]
-            rotation_text = f"ATE rotation RMSE {format_rmse(score.ate.rotation_deg, 2)}°"
-            rpe_rows.append([f"RPE, {path.name}", *rpe_texts, rotation_text])
+            rpe_rows.append([path.name, *rpe_texts, f"{format_rmse(score.ate.rotation_deg, 2)}°"])
         if rpe_rows:
             page.add_table(head, rpe_rows)
         for note in notes:

@@ -179,12 +179,7 @@ def make_whatif_page(analysis: WhatIfAnalysis) -> Page:
         )
         page.write_labelled("Change", no_change_text)
     head = ["", *make_column_headings(analysis)]
-    names = ("", "logged ", "replayed ", "changed ")
-    rows = [
-        [f"{name}{cell}" for name, cell in zip(names, row, strict=False)]
-        for row in make_statistic_rows(analysis)
-    ]
-    page.add_table(head, rows, right_aligned_columns=range(1, len(head)))
+    page.add_table(head, make_statistic_rows(analysis), right_aligned_columns=range(1, len(head)))
     if select_sweep_summaries(analysis):
         page.add_table(*make_sweep_table(analysis), right_aligned_columns=range(1, 7))
     for line in describe_sweep(analysis):
