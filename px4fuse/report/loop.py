@@ -193,12 +193,12 @@ def write_closures_and_rpe(page: Page, loop: Loop) -> None:
                 notes[score.reason] = None
                 continue
             if not rpe_rows:
-                head = ["path", *(error.delta_text for error in score.rpe), "ATE rotation RMSE"]
+                head = ["path", *(error.delta_text for error in score.rpe), "ATE rotation RMSE (°)"]
                 notes |= dict.fromkeys((describe_method(score), *score.notes, *score.warnings))
             rpe_texts = [
                 _format_error(error.translation_m, error.interval_m) for error in score.rpe
             ]
-            rpe_rows.append([path.name, *rpe_texts, f"{format_rmse(score.ate.rotation_deg, 2)}°"])
+            rpe_rows.append([path.name, *rpe_texts, format_rmse(score.ate.rotation_deg, 2)])
         if rpe_rows:
             page.add_table(head, rpe_rows)
         for note in notes:
@@ -240,8 +240,10 @@ def _format_closure_times(closure: Closure, loop: Loop) -> str:
 
 
 def _format_error(errors_m: Statistics | Unavailable, interval: RmseInterval | Unavailable) -> str:
+    if isinstance(errors_m, Unavailable):
+        return "–"
     interval_text = format_interval(interval)
-    return f"{format_rmse(errors_m, 3)} m" + (f" ({interval_text})" if interval_text else "")
+    return f"{errors_m.rmse:.3f} m" + (f" ({interval_text})" if interval_text else "")
 
 
 def make_pose_graph_page(graph: Graph) -> Page:
