@@ -375,7 +375,8 @@ def segments(monkeypatch, **parts: Any) -> list[tuple[float, float]]:
     found: list[tuple[float, float]] = []
     tenths = np.arange(0.0, 60.0, 0.1)
     usual = {
-        "imu": np.arange(0.0, 60.0, 0.01), "vision": tenths, "fused": tenths, "airborne": NONE,
+        "imu": np.arange(0.0, 60.0, 0.01), "attitude": np.arange(0.0, 60.0, 0.01),
+        "vision": tenths, "fused": tenths, "airborne": NONE,
         "delayed_state": tenths[::5], "primary_instances": ((-np.inf, 0),),
     }  # fmt: skip
     given = SimpleNamespace(**{**usual, **parts})
@@ -387,13 +388,20 @@ def segments(monkeypatch, **parts: Any) -> list[tuple[float, float]]:
 
     monkeypatch.setattr("px4fuse.ekf2.replay_segments._make_segment", keep)
     monkeypatch.setattr("px4fuse.ekf2.replay_segments.CORRELATION_ESTIMATION_TIME_S", 0.0)
-    imu, fused, delayed_state = (
-        pd.DataFrame(index=each) for each in (given.imu, given.fused, given.delayed_state)
+    imu, attitude, fused, delayed_state = (
+        pd.DataFrame(index=each)
+        for each in (given.imu, given.attitude, given.fused, given.delayed_state)
     )
     ekf2 = made(Ekf2, innovations={"north": fused}, primary_instances=given.primary_instances)
     record = made(FusionRecord, delayed_state=delayed_state)
     find_replay_segments(
-        made(Flight, airborne=given.airborne), imu, imu, ekf2, record, given.vision, is_gnss=False
+        made(Flight, airborne=given.airborne),
+        imu,
+        attitude,
+        ekf2,
+        record,
+        given.vision,
+        is_gnss=False,
     )
     return found
 
@@ -419,6 +427,9 @@ def test_ekf2_replay_segments_end_at_vision_and_imu_gaps(monkeypatch):
     assert len(segments(monkeypatch, imu=without(imu, 30.0, 30.04))) == 1
     parted = segments(monkeypatch, imu=without(imu, 30.0, 30.07))
     assert [start for start, _ in parted] == [1.0, 31.5]
+    # no segment is in a part of the flight before or after the IMU data
+    assert segments(monkeypatch, imu=imu[imu < 20.0]) == [(1.0, 19.99)]
+    assert [start for start, _ in segments(monkeypatch, imu=imu[imu > 40.0])] == [41.5]
     # another EKF2 instance has different states and splits the flight
     parted = segments(monkeypatch, primary_instances=((-np.inf, 0), (30.2, 1)))
     assert parted == [(1.0, 30.2), (31.5, 59.99)]

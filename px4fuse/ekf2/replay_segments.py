@@ -375,8 +375,8 @@ def find_replay_segments(
         )
     parameter_changes = [change for change in ekf2.parameter_changes if change.name in PARAMETERS]
     boundary_times_s += [magnetic_field_end_s, *(change.time_s for change in parameter_changes)]
-    earliest_start_s = max(attitude.index[0], position_times_s[0])
-    end_s = min(attitude.index[-1], position_times_s[-1] + 1.0)
+    earliest_start_s = max(attitude.index[0], imu_times_s[0] - MIN_IMU_GAP_S, position_times_s[0])
+    end_s = min(attitude.index[-1], imu_times_s[-1] + MIN_IMU_GAP_S, position_times_s[-1] + 1.0)
     takeoff_s = -np.inf
     if not isinstance(flight.airborne, Unavailable) and flight.airborne:
         takeoff_s = flight.airborne[0][0]
