@@ -127,7 +127,7 @@ def test_report_without_ekf2_replay_omits_difference_page(sample: Analysis) -> N
     ("share", "text"),
     [
         (0.47, "decreases by 47 %."),
-        (1.4, "explains 1.4 times the mean square difference KF - EKF2. Other replaced"),
+        (1.4, "decreases by 1.4 times its value without replacements. Other replaced properties"),
     ],
 )
 def test_kf_ekf2_difference_text_names_largest_contribution(sample, share, text) -> None:
