@@ -199,14 +199,16 @@ def _describe_replacement_effect(
     replacement: PropertyReplacement, explanation: DifferenceExplanation
 ) -> str:
     explained_fraction = replacement.position_mean_square_m2 / explanation.position_mean_square_m2
-    decrease_text, other_effect_text = f"{100 * explained_fraction:.0f} %", ""
+    more_than_all_text = ""
     if explained_fraction > 1.0:
-        decrease_text = f"{explained_fraction:.2g} times its value without replacements"
-        other_effect_text = " Other replaced properties increase the difference."
+        more_than_all_text = (
+            " of its value without replacements. Other replaced properties increase the difference"
+        )
     return (
         f"If KF uses EKF2's {replacement.name}, KF's position changes by up to "
         f"{replacement.position_moved_m:.2f} m (at {replacement.moved_at_s:.1f} s), and the mean "
-        f"square difference KF - EKF2 decreases by {decrease_text}.{other_effect_text}"
+        f"square difference KF - EKF2 decreases by {100 * explained_fraction:.0f} %"
+        f"{more_than_all_text}."
     )
 
 
