@@ -407,8 +407,8 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf2St
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     evaluated_updates = rows_inside(logged_innovations(ekf2), spans_s)
-    horizon_s = 0.0 if isinstance(ekf2.horizon_s, Unavailable) else ekf2.horizon_s
-    reset_times_s = find_horizontal_reset_times_s(ekf2) - horizon_s
+    fusion_horizon_delay_s = 0.0 if isinstance(ekf2.horizon_s, Unavailable) else ekf2.horizon_s
+    reset_times_s = find_horizontal_reset_times_s(ekf2) - fusion_horizon_delay_s
     reset_times_s = reset_times_s[is_inside_spans(reset_times_s, spans_s)]
     replayed_update_count = len(rows_inside(replay.updates, spans_s))
     longest_gap_s: float | Unavailable = Unavailable(

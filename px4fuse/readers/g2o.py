@@ -62,10 +62,10 @@ class _TaggedLines:
     # Line number and text of each line
     lines: list[tuple[int, str]]
 
-    def raise_where(self, is_invalid: BoolArray, fault: str, remedy: str = _LINE_REMEDY) -> None:
+    def raise_where(self, is_invalid: BoolArray, reason: str, remedy: str = _LINE_REMEDY) -> None:
         """Raise TrajectoryError for the first invalid line, if any."""
         for row in np.argwhere(is_invalid)[:1, 0].tolist():
-            raise _make_line_error(self.file_name, self.lines[row][0], fault, remedy)
+            raise _make_line_error(self.file_name, self.lines[row][0], reason, remedy)
 
     def parse(self, id_count: int, value_count: int) -> tuple[IntArray, Array]:
         """Return the vertex ids, shape (n, id_count), and the other values of all lines.
@@ -88,8 +88,8 @@ class _TaggedLines:
             )
             # If no invalid line is found, the first line is reported
             line_number, text = self.lines[next(invalid_rows, 0)]
-            fault = f"{quote(text)} does not have {column_count} columns with numbers"
-            raise _make_line_error(self.file_name, line_number, fault) from None
+            reason = f"{quote(text)} does not have {column_count} columns with numbers"
+            raise _make_line_error(self.file_name, line_number, reason) from None
         ids, values = table["ids"], np.ascontiguousarray(table["values"])
         is_invalid_id = [
             _VERTEX_ID_PATTERN.fullmatch(id_text) is None or abs(int(id_text)) > _MAX_VERTEX_ID
@@ -110,9 +110,9 @@ class _TaggedLines:
 
 
 def _make_line_error(
-    name: str, line_number: int, fault: str, remedy: str = _LINE_REMEDY
+    name: str, line_number: int, reason: str, remedy: str = _LINE_REMEDY
 ) -> TrajectoryError:
-    return TrajectoryError(f"{name}, line {line_number}: {fault}", remedy)
+    return TrajectoryError(f"{name}, line {line_number}: {reason}", remedy)
 
 
 def parse_g2o(text: str, name: str) -> PoseGraph:
