@@ -395,11 +395,12 @@ def _format_actions(causes: Sequence[DiagnosedCause], notes: Sequence[Note]) -> 
 
 def _format_action(action: Action) -> str:
     if action.where == "console":
-        # The command already contains the parameter name
+        # The sentence is "PARAMETER OLD → NEW UNIT", and the command contains the parameter name
         value_change_text = action.sentence.partition(" ")[2]
         change_text = value_change_text if len(action.commands) == 1 else action.sentence
         return f"EKF2: {', '.join(action.commands)} ({change_text})"
     if action.where == "shell":
+        # The command is "px4fuse compare LOG --OPTION VALUE"
         options_text = action.commands[0].partition(" --")[2]
         return f"KF: run again with --{options_text}"
     text = lowercase_first_letter(action.sentence.rstrip("."))

@@ -74,6 +74,7 @@ class BiasEstimator:
         bias_variance = np.minimum(self.variance_m2 + bias_noise_m2_per_s * interval_s, R_m2)
         innovation_m = innovation_m + self.bias_m
         R = R_m2 + bias_variance
+        # The mean of n samples has 1/n of the variance of one sample; the bias is the same for all
         S = bias_variance + (R_m2 + predicted_variance) / represented_sample_count
         test_ratio = innovation_m * innovation_m / (POSITION_BIAS_GATE**2 * S)
         K = bias_variance / S * (is_bias_updated & (test_ratio < 1.0))

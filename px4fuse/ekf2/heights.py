@@ -203,7 +203,9 @@ class BadAccelerationFlag:
         """
         *previous_barometer, previous_gnss = previous_innovations
         *barometer, gnss = innovations
-        # EKF2's test uses the latest innovation of each height sensor
+        # EKF2 tests the latest innovation of each height sensor. The barometer samples of an event
+        # precede its GNSS sample, so they are tested with the previous GNSS innovation. The last
+        # barometer and GNSS samples of the previous event are tested again
         latest_barometer = np.full_like(gnss, np.nan)
         is_acceleration_bad = np.zeros(len(gnss), bool)
         for sample_number, sample in enumerate((*previous_barometer, *barometer), start=1):

@@ -233,6 +233,7 @@ def read_truth(recording: Recording, positions: tuple[PositionTrack, ...]) -> Tr
         state = project_to_ned(samples, origin).join(samples[Columns.VELOCITY])
         return Truth(layout.topic, state[Columns.STATE], read_attitude(samples))
     mocap_truth = find_motion_capture_truth(positions)
+    # List the messages of this track as the source of ground truth, for px4fuse info
     for track in positions:
         if mocap_truth and track.name == mocap_truth.name:
             recording.record_stream("truth", *track.topics, clock=track.clock)

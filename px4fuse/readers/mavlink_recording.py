@@ -262,12 +262,13 @@ class Recording:
 
     def compute_boot_times_s(self, table: NDArray[Any], rows: IntArray) -> Array:
         """Return the time since boot (s) of each message; without timestamp, its receive time."""
-        # No message contains the boot clock
+        # If no message contains the boot clock, only receive times are known
         if not self.receive_to_boot_time_fit.reading_pair_count:
             return self.compute_receipt_boot_times_s(rows)
         if "time_boot_ms" in (table.dtype.names or ()):
             return np.asarray(table["time_boot_ms"] * 1e-3)
         timestamp_s: Array = table["time_usec"] * 1e-6
+        # time_usec is boot time or UNIX time; both are valid if the origin has the same clock
         is_boot_time = (timestamp_s > 0.0) & (
             (timestamp_s < MIN_UNIX_TIME_S) == (self.time_origin_s < MIN_UNIX_TIME_S)
         )

@@ -469,7 +469,8 @@ def _choose_time_unit(
 ) -> tuple[str, str]:
     """Return the unit of the timestamps, and the reason for this unit.
 
-    A missing unit is detected from UNIX times, or from a plausible median interval.
+    A missing unit is detected from UNIX times, or from a plausible median interval. ``units`` are
+    the units that are tested with the median interval.
     """
     if given_unit is not None:
         return given_unit, "the unit was given with --position-time-unit"

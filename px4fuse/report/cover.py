@@ -344,7 +344,10 @@ def _rotate_map_tracks(analysis: Analysis) -> tuple[dict[str, Array], tuple[str,
 
 
 def _select_map_tracks(analysis: Analysis) -> dict[str, Array]:
-    """Return positions, KF, EKF2 and ground truth; rows of a track: north (m), east (m)."""
+    """Return the tracks of the map by label; rows of a track: north (m), east (m).
+
+    The tracks are the measured positions, each filter that px4fuse runs, EKF2 and ground truth.
+    """
     flight, results = analysis.flight, select_north_and_east(analysis)
 
     def cut_to_flight(table: pd.DataFrame) -> Array:

@@ -144,7 +144,11 @@ def _check_mapping(value: Mapping[str, Any], annotation: Any, path: str, reasons
 
 
 def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple[Any, ...]:
-    # one invalid number invalidates a tuple of numbers
+    """Return the valid elements of a tuple.
+
+    An invalid record is omitted, and the reason is added to ``reasons``. An invalid number raises
+    :class:`_OutOfBoundsError`, because the other numbers of the tuple have no meaning without it.
+    """
     checked_elements = []
     for element in value:
         try:
