@@ -448,7 +448,7 @@ def test_info_command_shows_no_rate_for_a_single_sample(tmp_path):
     log.topics = [take(one, [50]) if one.name == name else one for one in log.topics]
     flight = write_and_read(log, tmp_path)
     aids = next(one for one in list_log_contents(flight).abilities if one.name.startswith("aiding"))
-    assert "external vision, height 1 sample" in aids.reason
+    assert "external vision, height: 1 sample" in aids.reason
     assert "nan" not in aids.reason
 
 

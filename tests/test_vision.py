@@ -522,7 +522,7 @@ def test_what_if_with_smaller_vision_gate_rejects_more() -> None:
     request = WhatIfRequest(log="flight.ulg", changes={"EKF2_EVP_GATE": 1.0})
     made_of = run_what_if(request, flight=flown())
     found, update_records = (
-        made_of.whatif,
+        made_of.statistics,
         {label: cells for label, *cells in make_statistic_rows(made_of)},
     )
     assert "external vision, position: mean NIS" in update_records
