@@ -543,8 +543,8 @@ def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCau
     if len(filters_affected_by_fault) == 2:
         fault_text = "The first fault" if len(ranked_causes) > 1 else "The fault"
         return (
-            f"{difference_text}. {fault_text} affects both KF and EKF2, so the difference KF − EKF2 "
-            "hardly shows the fault."
+            f"{difference_text}. {fault_text} affects both KF and EKF2, so the difference "
+            "KF − EKF2 hardly shows the fault."
         )
     rerun_difference_by_filter_m = {
         rerun.filter: rerun.after.difference_rms_m for rerun in reversed(reruns)
