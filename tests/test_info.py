@@ -102,7 +102,7 @@ def test_info_sample_counts_match_those_of_compare(sample_flight):
         ("EKF2 states", north.ekf2.state),
         ("EKF2 variances", north.ekf2.variance),
         ("EKF2 consistency", north.ekf2.innovations),
-        ("position error", north.truth),
+        ("error against ground truth", north.truth),
     ):
         assert ability(inventory, name).reason.startswith(f"from {len(samples)} ")
 
@@ -144,7 +144,7 @@ def test_info_lists_analyses_disabled_by_missing_topic(tmp_path, topic_, part, l
     inventory = inventory_of(make_log().drop(topic_), tmp_path)
     assert topic_ in source(inventory, part).unavailable
     assert {can.name for can in inventory.abilities if not can.possible} - {
-        "position error"
+        "error against ground truth"
     } == lost
     assert all(f"{topic_} is not logged" in ability(inventory, name).reason for name in lost)
     assert remedies(inventory).count("Record with SDLOG_PROFILE bit 0 (default).") == 1
@@ -211,11 +211,11 @@ def test_info_on_log_without_take_off_reports_never_airborne(tmp_path):
 
 def test_info_does_not_use_position_source_as_ground_truth(tmp_path):
     log = make_log().add(odometry("vehicle_mocap_odometry", 10.0, 16))
-    assert ability(inventory_of(log, tmp_path), "position error").possible
+    assert ability(inventory_of(log, tmp_path), "error against ground truth").possible
     flight = read_log(log.drop("vehicle_visual_odometry").write(tmp_path / "made.ulg"))
     inventory = list_log_contents(flight)
     assert source(inventory, "position").name == "vehicle_mocap_odometry"
-    assert not ability(inventory, "position error").possible
+    assert not ability(inventory, "error against ground truth").possible
 
 
 # ---- gaps -------------------------------------------------------------------------------------
@@ -271,7 +271,7 @@ def test_info_lists_exactly_the_analyses_that_compare_performs(flight: Flight):
         ("EKF2 states", north.ekf2.state),
         ("EKF2 variances", north.ekf2.variance),
         ("EKF2 consistency", north.filters["ekf2"]),
-        ("position error", north.truth),
+        ("error against ground truth", north.truth),
     ):
         assert ability(inventory, name).possible != isinstance(part, Unavailable), name
 

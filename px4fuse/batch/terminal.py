@@ -37,7 +37,7 @@ def format_summary(batch_result: BatchResult) -> Page:
     if sorted_logs:
         rows = [_make_log_row(log) for log in sorted_logs[:MAX_LISTED_LOGS]]
         page.add_table(
-            ("", "log", "diagnosis", *[""] * len(SIGMA_RATIO_LABELS)),
+            ("", "log", "diagnosis", *SIGMA_RATIO_LABELS.values()),
             rows,
             right_aligned_columns=range(3, 3 + len(SIGMA_RATIO_LABELS)),
         )
@@ -56,15 +56,12 @@ def format_summary(batch_result: BatchResult) -> Page:
 
 def _make_log_row(log: LogSummary) -> tuple[Cell, ...]:
     colour = SEVERITY_COLOURS.get(log["severity"], MUTED_COLOUR)
-    ratio_by_label = {label: log.get(f"{name}_ratio") for name, label in SIGMA_RATIO_LABELS.items()}
+    ratios = (log.get(f"{name}_ratio") for name in SIGMA_RATIO_LABELS)
     return (
         (SEVERITY_SIGNS[log["severity"]][0], colour),
         log["name"],
         log["headline"],
-        *(
-            f"{label} {'–' if ratio is None else format_ratio(ratio)}"
-            for label, ratio in ratio_by_label.items()
-        ),
+        *("–" if ratio is None else format_ratio(ratio) for ratio in ratios),
     )
 
 
@@ -89,9 +86,9 @@ def format_differences(results: ChangeResults) -> Page:
         rows.append(
             (
                 number.label,
-                _format_value("A", number.a, display_factor),
+                _format_value(number.a, display_factor),
                 _format_interval(number.a_interval),
-                _format_value("B", number.b, display_factor),
+                _format_value(number.b, display_factor),
                 _format_interval(number.b_interval),
                 unit,
             )
@@ -116,8 +113,8 @@ def _format_setting(value: float | str | None) -> str:
     return f"{value:.6g}" if isinstance(value, int | float) else value or "–"
 
 
-def _format_value(label: str, value: float | None, factor: float) -> str:
-    return "" if value is None else f"{label} {format_number(factor * value)}"
+def _format_value(value: float | None, factor: float) -> str:
+    return "" if value is None else format_number(factor * value)
 
 
 def _format_interval(interval: ConfidenceInterval | None) -> str:

@@ -333,7 +333,7 @@ def _list_ekf2_and_truth_analyses(
         ("EKF2 states", "samples of EKF2's position and velocity"),
         ("EKF2 variances", "samples of EKF2's position and velocity variances"),
         ("EKF2 consistency", "EKF2 innovations"),
-        ("position error", "samples of ground truth"),
+        ("error against ground truth", "samples of ground truth"),
     )
     for (name, sample_text), data in zip(names_and_sample_texts, required_data, strict=True):
         if isinstance(data, pd.DataFrame):

@@ -16,15 +16,15 @@ from px4fuse.report.phrases import format_noise_estimate, format_settings
 
 TUNING_HEAD = (
     "axis",
-    "SIGMA_A (m/s²), 95 %",
-    "SIGMA_Z (m), 95 %",
-    "log-likelihood gain",
-    "on 2nd half",
-    "lag-1 autocorrelation",
+    "SIGMA_A (m/s²)\nestimate (95 %)",
+    "SIGMA_Z (m)\nestimate (95 %)",
+    "log-likelihood\ngain (nats per\nmeasurement)",
+    "log-likelihood\ngain, 2nd half\nof the flight",
+    "lag-1 auto-\ncorrelation of\ninnovations",
 )
 TUNING_NOTE = (
-    "Log-likelihood gain in nats per measurement; on 2nd half of the flight: gain of the noise "
-    "estimated from the 1st half. Autocorrelation of the innovations before → after tuning."
+    "Gain on the 2nd half: with SIGMA_A and SIGMA_Z estimated on the 1st half. Autocorrelation: "
+    "before → after tuning."
 )
 
 
