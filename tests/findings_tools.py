@@ -186,7 +186,11 @@ def axis(name: str = "north", **parts: Any) -> Any:
         measurement_time_s=np.arange(0.0, 120.0), measurement_m=np.zeros(120),
     )  # fmt: skip
     return SimpleNamespace(
-        axis=axis, filters=filters, tracks=tracks, ekf2=tracks["ekf2"], **{"truth": NONE, **parts}
+        axis=axis,
+        filters=filters,
+        tracks=tracks,
+        ekf2_tracks=tracks["ekf2"],
+        **{"truth": NONE, **parts},
     )
 
 

@@ -217,7 +217,7 @@ def test_height_error_in_gap_below_3_times_rmse_is_not_reported(
     ekf2 = FilterTracks(height_m.to_frame("position_m"), not_logged, not_logged)
     down = SimpleNamespace(
         tracks={"ekf2": ekf2},
-        ekf2=ekf2,
+        ekf2_tracks=ekf2,
         truth=pd.DataFrame({"position_m": 0.0}, index=time_s),
     )
     one = SimpleNamespace(axes={"down": down})

@@ -43,7 +43,7 @@ def predicted(result: AxisComparison, times: Array) -> Array:
 def ekf2_times_within(result: AxisComparison) -> Array:
     """Return EKF2's sample times within the KF replay."""
     first, last = result.kf_run.steps.index[[0, -1]]
-    times = result.ekf2.state.index.to_numpy()
+    times = result.ekf2_tracks.state.index.to_numpy()
     return times[(times >= first) & (times <= last)]
 
 
@@ -160,7 +160,7 @@ class TestSimulatedFlight:
         for result in made.axes.values():
             times = ekf2_times_within(result)
             p, v, *_ = predicted(result, times)
-            ekf2 = result.ekf2.state.loc[times]
+            ekf2 = result.ekf2_tracks.state.loc[times]
             dp, dv = p - ekf2["position_m"], v - ekf2["velocity_m_s"]
             assert result.difference.count == len(times)
             statistics = (rms, np.mean, lambda values: np.max(np.abs(values)))
@@ -210,8 +210,8 @@ class TestMissingParts:
             assert isinstance(ekf2, UntestedFilter)
             assert ekf2.reason == comparison.flight.ekf2.reason
             for part in (
-                result.ekf2.state, result.ekf2.variance, result.ekf2.innovations,
-                result.difference, ekf2.truth,
+                result.ekf2_tracks.state, result.ekf2_tracks.variance,
+                result.ekf2_tracks.innovations, result.difference, ekf2.truth,
             ):  # fmt: skip
                 assert part == comparison.flight.ekf2
 
@@ -229,7 +229,7 @@ class TestMissingParts:
 
     def test_compare_without_ekf2_variances_has_rmse_but_no_nees(self) -> None:
         for result in compare(aisle_flight(ekf2=Estimator(variance_logged=False))).axes.values():
-            assert isinstance(result.ekf2.variance, Unavailable)
+            assert isinstance(result.ekf2_tracks.variance, Unavailable)
             assert result.filters["ekf2"].sigma_p_median_m is None
             assert result.filters["ekf2"].truth.nees_position_mean is None
             assert result.filters["ekf2"].truth.position_rmse_m == pytest.approx(0.05, rel=0.06)
@@ -249,7 +249,7 @@ class TestMissingParts:
         result = compare(flight, axes=("north",)).main
         truth = result.filters["ekf2"].truth
         assert truth.count == 9
-        variance = result.ekf2.variance["position_variance_m2"]
+        variance = result.ekf2_tracks.variance["position_variance_m2"]
         assert truth.nees_position_mean == pytest.approx(
             truth.position_rmse_m**2 / np.interp(40.5, variance.index, variance), rel=0.1
         )

@@ -54,8 +54,8 @@ def test_time_without_positions_is_plotted_but_not_evaluated() -> None:
         assert (result.filters, result.difference) == (other.filters, other.difference)
         shown = result.with_whole_flight_tracks()
         for table, shown_table in (
-            (result.ekf2.state, shown.ekf2.state),
-            (result.ekf2.variance, shown.ekf2.variance),
+            (result.ekf2_tracks.state, shown.ekf2_tracks.state),
+            (result.ekf2_tracks.variance, shown.ekf2_tracks.variance),
             (result.truth, shown.truth),
         ):
             assert table.index[-1] <= 80.0
@@ -66,7 +66,7 @@ def test_flight_events_list_rejections_per_axis() -> None:
     comparison = compare(aisle_flight(ekf2=Estimator(rejected_fraction=0.2)))
     found = collect_events(comparison)
     for result in comparison.axes.values():
-        frame = result.ekf2.innovations
+        frame = result.ekf2_tracks.innovations
         assert list(found.rejection_times_s[result.axis.name]) == list(
             frame.index[frame["rejected"] > 0]
         )

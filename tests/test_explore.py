@@ -180,7 +180,7 @@ def test_explore_page_buttons_set_estimated_or_ekf2_noises(
     assert z == pytest.approx(tuned.sigma_z.value, rel=5e-3)
     page.click("#ekf2-r")
     settle(page)
-    frame = explored[1].main.ekf2.innovations
+    frame = explored[1].main.ekf2_tracks.innovations
     r = float(np.sqrt(frame["observation_variance_m2"].median()))
     assert float(page.ask("document.getElementById('sigma-z-value').value")) == pytest.approx(r)
 

@@ -187,7 +187,7 @@ def test_explore_page_ekf2_curves_equal_logged_values(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     result = explored[1].main
-    state, variance = result.ekf2.state.dropna(), result.ekf2.variance.dropna()
+    state, variance = result.ekf2_tracks.state.dropna(), result.ekf2_tracks.variance.dropna()
     for view, name, column, logged in (
         ("track", "position:ekf2", "p", state["position_m"]),
         ("speed", "velocity:ekf2", "v", state["velocity_m_s"]),
@@ -204,7 +204,7 @@ def test_explore_page_ekf2_curves_equal_logged_values(
     open_view(page, "errors")
     rejected = "e.model('innovation:rejected-source').data.x.length"
     count = ask(page, f"Explore.then((e) => {rejected})")
-    assert count == (result.ekf2.innovations["rejected"] > 0).sum()
+    assert count == (result.ekf2_tracks.innovations["rejected"] > 0).sum()
 
 
 # ------------------------------------------------------------------ the step

@@ -99,9 +99,9 @@ def test_info_sample_counts_match_those_of_compare(sample_flight):
     )
     north = comparison.axes["north"]
     for name, samples in (
-        ("EKF2 states", north.ekf2.state),
-        ("EKF2 variances", north.ekf2.variance),
-        ("EKF2 consistency", north.ekf2.innovations),
+        ("EKF2 states", north.ekf2_tracks.state),
+        ("EKF2 variances", north.ekf2_tracks.variance),
+        ("EKF2 consistency", north.ekf2_tracks.innovations),
         ("error against ground truth", north.truth),
     ):
         assert ability(inventory, name).reason.startswith(f"from {len(samples)} ")
@@ -268,8 +268,8 @@ def test_info_lists_exactly_the_analyses_that_compare_performs(flight: Flight):
     assert ability(inventory, "compare").possible
     for name, part in (
         ("acceleration", north.axis.acceleration),
-        ("EKF2 states", north.ekf2.state),
-        ("EKF2 variances", north.ekf2.variance),
+        ("EKF2 states", north.ekf2_tracks.state),
+        ("EKF2 variances", north.ekf2_tracks.variance),
         ("EKF2 consistency", north.filters["ekf2"]),
         ("error against ground truth", north.truth),
     ):

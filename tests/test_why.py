@@ -45,7 +45,7 @@ def test_position_difference_on_report_page_is_kf_minus_ekf2(sample: Analysis) -
     result = next(r for r in sample.axes.values() if r.axis.name == "aisle")
     track = predict_track(result.kf_run, explanation.times_s)
     position, speed = track["position_m"].to_numpy(), track["velocity_m_s"].to_numpy()
-    logged = result.ekf2.state.loc[explanation.times_s]
+    logged = result.ekf2_tracks.state.loc[explanation.times_s]
     difference = position - logged["position_m"].to_numpy()
     np.testing.assert_allclose(explanation.kf_minus_ekf2_m, difference, atol=1e-9)
     assert explanation.position_mean_square_m2 == pytest.approx(np.mean(difference**2))

@@ -21,7 +21,6 @@ from px4fuse.comparison.model import (
     PreparedComparison,
     UntestedFilter,
     UpdateStatistics,
-    select_north_and_east,
 )
 from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import HorizontalNis, assess_horizontal_nis
@@ -57,16 +56,15 @@ def compare(prepared_comparison: PreparedComparison) -> Comparison:
         axis.name: _compare_axis(prepared_comparison, ekf2, axis, is_main=axis.name == main_name)
         for axis in prepared_comparison.input_axes
     }
-    comparison = Comparison(
-        **vars(prepared_comparison) | {"notes": notes}, axes=axes, horizontal={}
-    )
-    north_and_east = select_north_and_east(comparison)
+    north_and_east = [axes[name] for name in ("north", "east") if name in axes]
     horizontal_nis = {
         name: nis
         for name in FILTER_NAMES
         if (nis := _assess_horizontal_innovations(axis.tracks[name] for axis in north_and_east))
     }
-    return replace(comparison, horizontal=horizontal_nis)
+    return Comparison(
+        **vars(prepared_comparison) | {"notes": notes}, axes=axes, horizontal=horizontal_nis
+    )
 
 
 def _compare_axis(
@@ -294,7 +292,9 @@ def compute_position_errors(
     """
     if isinstance(axis_result.truth, Unavailable):
         return axis_result.truth
-    state, variance = find_compared_track(axis_result.tracks[filter_name], axis_result.ekf2.state)
+    state, variance = find_compared_track(
+        axis_result.tracks[filter_name], axis_result.ekf2_tracks.state
+    )
     if isinstance(state, Unavailable):
         return state
     time_s = state.index.to_numpy()

@@ -133,7 +133,7 @@ def _make_comparable_settings(
 def _find_difference_at_times_without_replay(
     axis_result: AxisComparison, kf_run: KfRun, spans_s: Spans
 ) -> DifferenceOutsideReplay | None:
-    if isinstance(state := axis_result.ekf2.state, Unavailable):
+    if isinstance(state := axis_result.ekf2_tracks.state, Unavailable):
         return None
     position_m = state["position_m"]
     position_m = position_m[~is_inside_spans(position_m.index, spans_s)]

@@ -86,6 +86,6 @@ def collect_events(comparison: Comparison) -> Events:
         rejection_times_s={
             axis_result.axis.name: frame.index[frame["rejected"] > 0].to_numpy()
             for axis_result in comparison.axes.values()
-            if isinstance(frame := axis_result.ekf2.innovations, pd.DataFrame)
+            if isinstance(frame := axis_result.ekf2_tracks.innovations, pd.DataFrame)
         },
     )

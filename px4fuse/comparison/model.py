@@ -177,7 +177,7 @@ class AxisComparison(Record, kw_only=True):
     whole_flight_tracks: NotInJson[tuple[FilterTracks, TableOrUnavailable]] = NOT_IN_JSON
 
     @property
-    def ekf2(self) -> FilterTracks:
+    def ekf2_tracks(self) -> FilterTracks:
         return self.tracks["ekf2"]
 
     def with_whole_flight_tracks(self) -> "AxisComparison":

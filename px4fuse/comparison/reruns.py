@@ -282,7 +282,7 @@ def _find_statistics_without_change(
     differs too much from the log, of the unchanged replay. The second value is False only for
     statistics of a replay.
     """
-    replayed, ekf2 = tested_filter.rerun(axis_result, {}), axis_result.ekf2
+    replayed, ekf2 = tested_filter.rerun(axis_result, {}), axis_result.ekf2_tracks
     evaluated_spans_s, innovations = tested_filter.evaluated_spans_s, ekf2.innovations
     if evaluated_spans_s is None:
         return replayed, True
@@ -335,7 +335,7 @@ def _rotate_direction(direction: Array, rotation_deg: float) -> Array:
 def _rerun_kf(
     comparison: Comparison, tuning: TuningByAxis, axis_result: AxisComparison, change: Change
 ) -> RunStatistics:
-    axis, truth, ekf2_state = axis_result.axis, axis_result.truth, axis_result.ekf2.state
+    axis, truth, ekf2_state = axis_result.axis, axis_result.truth, axis_result.ekf2_tracks.state
     kf_settings: dict[str, Any] = {
         name: change[name] for name in change if name in vars(Settings())
     }
@@ -438,7 +438,7 @@ def _summarise_replay(
     )
     published_track = project(ekf2_replay.published_state, axis, comparison.segment)
     published_track = rows_inside(published_track, evaluated_spans_s)
-    logged_state, track_compared_with_kf = axis_result.ekf2.state, published_track
+    logged_state, track_compared_with_kf = axis_result.ekf2_tracks.state, published_track
     # Without a change, compare KF with the logged EKF2, as in the report
     if not change and not isinstance(logged_state, Unavailable):
         track_compared_with_kf = rows_inside(logged_state, evaluated_spans_s)

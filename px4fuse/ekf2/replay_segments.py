@@ -162,8 +162,8 @@ class HeightSamples:
 class ReplaySegment:
     """Part of a flight without gaps, with n prediction steps of EKF2.
 
-    The nominal attitude is the attitude that EKF2 published in the log. Vectors are in NED by
-    default.
+    The nominal attitude is the attitude that EKF2 published in the log. Vectors are in NED, unless
+    another frame is given.
 
     Attributes
     ----------

@@ -185,7 +185,7 @@ def _pack_nis_bands(innovation_count: int, encoder: ArrayEncoder) -> list[dict[s
 
 
 def _make_ekf2_data(result: AxisComparison, encoder: ArrayEncoder) -> PageData | None:
-    ekf2, summary = result.ekf2, result.filters["ekf2"]
+    ekf2, summary = result.ekf2_tracks, result.filters["ekf2"]
     if isinstance(ekf2.state, Unavailable):
         return None
     state = ekf2.state.dropna()

@@ -37,8 +37,8 @@ from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 
 # Half-width (s) of the range of time offsets that is tested around the result of the coarse search
 INITIAL_SEARCH_HALF_WIDTH_S = 0.1
-# Half-width of the likelihood curve around the estimated time offset: this multiple of the
-# estimate's σ, but at least this time (s)
+# The likelihood curve covers the estimated time offset ± this multiple of its σ, and at least
+# ± this time (s)
 LIKELIHOOD_CURVE_HALF_WIDTH_SIGMAS, MIN_LIKELIHOOD_CURVE_HALF_WIDTH_S = 3.5, 0.01
 # Width of the range of tested time offsets ÷ width of the likelihood curve. The curve is centred at
 # the maximum-likelihood estimate, which is not exactly in the middle of this range

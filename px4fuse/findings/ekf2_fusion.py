@@ -113,7 +113,7 @@ def detect_unfused_positions(analysis: PreparedComparison) -> Findings:
         yield from _detect_slow_restart(analysis, fusion_flag)
     if source is None or fused_fraction >= FUSED_FRACTION_FOR_WARNING:
         return
-    title = f"EKF2 never fused the {source.positions_phrase}"
+    title = f"EKF2 never fused the {source.positions_text}"
     evidence: dict[str, float | str] = {
         "fused_fraction": fused_fraction,
         "source_interval_s": 1.0 / source.compute_rate_hz(),
@@ -141,7 +141,7 @@ def detect_unfused_positions(analysis: PreparedComparison) -> Findings:
         action = f"Record with SDLOG_PROFILE 129 (default and vision). {action}"
     if fused_fraction:
         title = (
-            f"EKF2 fused the {source.positions_phrase} only {format_percent(fused_fraction)} of "
+            f"EKF2 fused the {source.positions_text} only {format_percent(fused_fraction)} of "
             "the time"
         )
     if unmet_condition.fault:
@@ -245,7 +245,7 @@ def _detect_slow_restart(analysis: PreparedComparison, fusion_flag: pd.Series) -
         yield make_note(
             "source_rate_at_limit",
             f"After a gap EKF2 resumed fusion {longest_delay_s:.1f} s late: "
-            f"{source.positions_phrase} come at only {rate_hz:.1f} Hz. EKF2 (v1.14 and later) "
+            f"{source.positions_text} come at only {rate_hz:.1f} Hz. EKF2 (v1.14 and later) "
             f"starts fusion when two positions arrive within {EV_START_INTERVAL_S:g} s.",
             "Send the position at 10 Hz.",
             {"rate_hz": rate_hz, "longest_s": longest_delay_s, "count": len(delay_spans)},

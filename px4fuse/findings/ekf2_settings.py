@@ -158,7 +158,7 @@ def _find_rejections(analysis: Analysis, gate: float) -> Findings:
     if down_comparison is not None and down_comparison is not analysis.main:
         results.append(down_comparison)
     for result in results:
-        innovations = result.ekf2.innovations
+        innovations = result.ekf2_tracks.innovations
         if isinstance(innovations, Unavailable):
             continue
         rejected_flags = innovations["rejected"].dropna()
@@ -275,7 +275,7 @@ def _assess_span(
     errors = compute_position_errors(analysis.main, "ekf2")
     if not isinstance(errors, Unavailable):
         rmse_m = rms(errors["error_m"].loc[start_s:end_s])
-    innovations = analysis.main.ekf2.innovations
+    innovations = analysis.main.ekf2_tracks.innovations
     if isinstance(innovations, Unavailable):
         return innovations, rmse_m
     samples = innovations[(innovations.index >= start_s) & (innovations.index < end_s)]

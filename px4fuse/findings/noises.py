@@ -453,7 +453,7 @@ def _find_sigma_action_without_replay(
 
 def find_ekf2_noise_m(result: AxisComparison) -> float:
     """Return EKF2's median measurement noise √R (m) along an axis; NaN if unknown."""
-    innovations = result.ekf2.innovations
+    innovations = result.ekf2_tracks.innovations
     if isinstance(innovations, Unavailable):
         return np.nan
     return float(np.sqrt(innovations["observation_variance_m2"].median()))

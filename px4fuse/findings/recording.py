@@ -174,7 +174,7 @@ def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
     reason = reason_by_source.get(VISION_TOPIC, f"{VISION_TOPIC} is not in this log")
     yield make_warning(
         "source_not_logged",
-        f"The log lacks the {source.positions_phrase} that PX4 received. Reason: {reason}. "
+        f"The log lacks the {source.positions_text} that PX4 received. Reason: {reason}. "
         f"px4fuse uses {source.name} ({source.description}) at {rate_hz:.1f} Hz instead.",
         f"Set SDLOG_PROFILE to {sdlog_profile | VISION_PROFILE_MASK} (bit 7: vision topics) and "
         "fly again.",

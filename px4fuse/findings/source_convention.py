@@ -143,7 +143,7 @@ def _is_effect_of_wrong_convention(item: Finding) -> bool:
 def _detect_position_faults(
     convention: Convention, faults: ConventionFaults, source: PositionTrack
 ) -> Findings:
-    positions_text = source.positions_phrase
+    positions_text = source.positions_text
     is_position_file = source.alignment is not None
     log_odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
     evidence_sentence = (

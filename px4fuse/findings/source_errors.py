@@ -162,7 +162,7 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
         return
     yield (make_error if fraction >= MIN_REPEATED_FRACTION_FOR_ERROR else make_warning)(
         "source_samples_repeated",
-        f"{count} of {len(is_repeated)} {analysis.source.positions_phrase} repeat the previous "
+        f"{count} of {len(is_repeated)} {analysis.source.positions_text} repeat the previous "
         f"position ({format_percent(fraction)}). KF and EKF2 use each repetition as a measurement.",
         "Send each position once, with its time of measurement.",
         {"count": count, "share": fraction},
@@ -242,7 +242,7 @@ def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResi
     if jitter_s is not None and (clock_map is None or clock_map.distinct_stamps is None):
         yield (make_error if jitter_s >= MIN_JITTER_FOR_ERROR_S else make_warning)(
             "source_timestamp_jitter",
-            f"The timestamps of the {analysis.source.positions_phrase} jitter by "
+            f"The timestamps of the {analysis.source.positions_text} jitter by "
             f"{1e3 * jitter_s:.0f} ms (1 σ). At 1 m/s this is a position error of "
             f"{format_metres(jitter_s)} m.",
             "Send the time of measurement with each position, not the time of processing, sending "
@@ -266,7 +266,7 @@ def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResi
 
 def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: ErrorFit) -> Findings:
     periodic_error = find_periodic_error(error_fit)
-    positions_text = analysis.source.positions_phrase
+    positions_text = analysis.source.positions_text
     if periodic_error is not None:
         yield (
             make_error

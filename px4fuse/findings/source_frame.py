@@ -50,7 +50,7 @@ def make_frd_positions_finding(analysis: Analysis) -> Finding:
     """Make the finding that positions are in FRD, so that their x axis is not north."""
     ekf2, sensor_name = analysis.flight.ekf2, analysis.source.kind_name
     fault = (
-        f"{analysis.source.positions_phrase} are in FRD: their x axis points "
+        f"{analysis.source.positions_text} are in FRD: their x axis points "
         "along the heading at the start, not north."
     )
     note_action = f"In this report, north is the x axis of {sensor_name}."
@@ -114,7 +114,7 @@ def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Find
     yield finding(
         "error" if abs(rotation_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
         finding_id,
-        f"{analysis.source.positions_phrase} are rotated by {rotation_deg:+.0f}° relative to "
+        f"{analysis.source.positions_text} are rotated by {rotation_deg:+.0f}° relative to "
         f"{reference}. The rotation (± {1.96 * sigma_deg:.0f}°, 95 %) is clockwise from above and "
         f"constant over the flight. {reason}",
         action,
@@ -181,7 +181,7 @@ def _make_heading_drift_finding(analysis: Analysis, heading_error: HeadingError)
         "error" if abs(heading_change_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_error",
         f"EKF2's heading drifts by {heading_change_deg:+.0f}° relative to the "
-        f"{source.positions_phrase}. The heading error is {' and '.join(error_texts)} "
+        f"{source.positions_text}. The heading error is {' and '.join(error_texts)} "
         f"(clockwise from above, estimated from {estimation_data_text}). A constant rotation of "
         f"the positions cannot correct the drift. Possible cause: {possible_cause}.",
         " Alternatively: ".join(filter(None, (calibration_advice, action)))

@@ -89,7 +89,7 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
             action = f"{find_source_texts(source).data_link_check} at {start_s:.1f} s."
         else:
             message = (
-                f"{source.positions_phrase} are missing in the log for {duration_text}, but EKF2 "
+                f"{source.positions_text} are missing in the log for {duration_text}, but EKF2 "
                 "fused them. KF has no measurement in the gap."
             )
             action = _find_action_for_unlogged_positions(analysis, start_s, end_s)
@@ -138,7 +138,7 @@ def _make_source_stops_or_begins_finding(
     return finding(
         "error" if is_dead_reckoning else "warning",
         finding_id,
-        f"{source.positions_phrase} {event} in flight at {event_s:.1f} s, {duration_s:.1f} s "
+        f"{source.positions_text} {event} in flight at {event_s:.1f} s, {duration_s:.1f} s "
         f"{start_or_end_text} of the flight.{aiding_sentence}{effect_sentence}",
         f"{find_source_texts(source).data_link_check} for the time {before_or_after} "
         f"{event_s:.1f} s.{action}",
@@ -172,7 +172,7 @@ def _find_ekf2_errors_at_end(analysis: Analysis, span_s: Span) -> dict[str, floa
 def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
     """Describe the position errors of KF and EKF2 at the end of a gap."""
     result, end_s = analysis.main, gap_span_s[1]
-    axis, ekf2, ekf2_state = result.axis, analysis.flight.ekf2, result.ekf2.state
+    axis, ekf2, ekf2_state = result.axis, analysis.flight.ekf2, result.ekf2_tracks.state
     reference_m = float(axis.measurement_m[np.searchsorted(axis.measurement_time_s, end_s)])
     quantity = "Distance from the estimate to the first position after the gap,"
     if isinstance(result.truth, pd.DataFrame):
@@ -189,7 +189,7 @@ def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
         elif isinstance(ekf2, Ekf2) and ekf2.aids:
             aiding_sentence = "In the gap KF and EKF2 rely on the IMU alone."
         ekf2_text = f"EKF2 {format_metres(abs(positions_before.iloc[-1] - reference_m))} m"
-        variance = result.ekf2.variance
+        variance = result.ekf2_tracks.variance
         if isinstance(variance, pd.DataFrame) and len(variance):
             variance_m2 = np.interp(
                 positions_before.index[-1], variance.index, variance["position_variance_m2"]
@@ -240,7 +240,7 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
         yield make_note(
             "source_samples_lost",
             f"The recording lacks {format_percent(lost_fraction)} of the "
-            f"{source.positions_phrase}. {lost_count} of {sent_count} positions are missing (one "
+            f"{source.positions_text}. {lost_count} of {sent_count} positions are missing (one "
             f"per {median_interval_s:.2f} s is expected). EKF2 may have received these samples.",
             "Record on the companion computer or on a link without message loss. Or set "
             "SDLOG_PROFILE to 129: the ULog then contains the received positions.",
@@ -281,7 +281,7 @@ def detect_downsampling(analysis: Analysis) -> Findings:
     rate_hz, source_rate_hz = 1.0 / mean_interval_s, 1.0 / period_s
     severity: Severity = "warning"
     message = (
-        f"{source.positions_phrase} arrive at {rate_hz:.2g} Hz, downsampled from "
+        f"{source.positions_text} arrive at {rate_hz:.2g} Hz, downsampled from "
         f"{source_rate_hz:.2g} Hz. The intervals are whole multiples of {period_s:.3g} s, so "
         f"{format_percent(lost_fraction)} of the positions are missing."
     )

@@ -171,7 +171,7 @@ def detect_low_pass(analysis: Analysis) -> Findings:
         make_finding = make_error if low_pass.lag_s >= MIN_LAG_FOR_ERROR_S else make_warning
         yield make_finding(
             "source_low_pass_filtered",
-            f"{analysis.source.positions_phrase} are low-pass filtered and lag by "
+            f"{analysis.source.positions_text} are low-pass filtered and lag by "
             f"{low_pass.lag_s:.2f} s. The correlation of successive errors is "
             f"{low_pass.correlation:.1f}; the noise before filtering is {low_pass.sigma_z_m:.2g} "
             "m. KF and EKF2 lag, and their σ is too small.",
@@ -214,7 +214,7 @@ def detect_jumps(analysis: Analysis) -> Findings:
     yield finding(
         "error" if size_m >= MIN_JUMP_FOR_ERROR_M else "warning",
         "source_position_jump",
-        f"{analysis.source.positions_phrase} {jump_text} at {time_s:.1f} s and "
+        f"{analysis.source.positions_text} {jump_text} at {time_s:.1f} s and "
         f"{'return afterwards' if returns else 'stay there'}. The IMU does not measure this motion "
         f"(± {1.96 * sigma_m:.2f} m, 95 %). {cause} KF and EKF2 follow the jump with consistent "
         "innovations.",
@@ -426,7 +426,7 @@ def detect_outliers(analysis: Analysis) -> Findings:
     yield finding(
         "error" if outlier_fraction >= MIN_OUTLIER_FRACTION_FOR_ERROR else "warning",
         "source_outliers",
-        f"{outlier_count} of {axis_tuning.count} {analysis.source.positions_phrase} "
+        f"{outlier_count} of {axis_tuning.count} {analysis.source.positions_text} "
         f"({format_percent(outlier_fraction, 1)}) are outliers of up to "
         f"{format_metres(outlier_sizes_m.max())} m. Median distance of the outliers to "
         f"{reference}: {format_metres(float(np.median(outlier_sizes_m)))} m. "
@@ -468,7 +468,7 @@ def compute_outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[
 
 
 def _format_rejected_outliers(analysis: Analysis, outlier_time_s: Array) -> str:
-    innovations = analysis.main.ekf2.innovations
+    innovations = analysis.main.ekf2_tracks.innovations
     position_count = len(analysis.main.axis.measurement_time_s)
     if (
         isinstance(innovations, Unavailable)

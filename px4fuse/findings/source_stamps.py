@@ -55,7 +55,7 @@ ANSWER_TIMESYNC_ACTION = (
 
 
 def detect(analysis: Analysis) -> Findings:
-    clock_map, positions_text = analysis.source.clock_map, analysis.source.positions_phrase
+    clock_map, positions_text = analysis.source.clock_map, analysis.source.positions_text
     if clock_map is None:
         yield from detect_arrival_timestamps(analysis)
         yield from detect_varying_latency(analysis)
@@ -96,7 +96,7 @@ def detect_bursts(analysis: Analysis) -> Findings:
         return
     yield make_error(
         "source_timestamp_jitter",
-        f"The timestamps of the {analysis.source.positions_phrase} come in bursts of "
+        f"The timestamps of the {analysis.source.positions_text} come in bursts of "
         f"{burst_size:.0f}, every {pause_s:.2g} s ({analysis.source.compute_rate_hz():.3g} Hz on "
         f"average). The positions were measured up to {pause_s:.2g} s earlier. At 1 m/s this is a "
         f"position error of up to {format_metres(pause_s)} m.",
@@ -112,7 +112,7 @@ def detect_repeated_timestamps(
     rate_hz = sample_count / (distinct_count * resolution_s)
     yield make_error(
         "source_timestamps_shared",
-        f"The timestamps of the {analysis.source.positions_phrase} have a resolution of "
+        f"The timestamps of the {analysis.source.positions_text} have a resolution of "
         f"{resolution_s:.3g} s. The {sample_count} samples ({rate_hz:.2g} Hz) have only "
         f"{distinct_count} different timestamps. px4fuse uses the first sample of each timestamp. "
         f"At 1 m/s the position error is up to {format_metres(resolution_s)} m.",
@@ -134,7 +134,7 @@ def detect_timestamp_unit(analysis: Analysis, clock_name: str) -> Findings:
         )
     yield make_error(
         "source_timestamp_unit",
-        f"The timestamps of the {analysis.source.positions_phrase} are "
+        f"The timestamps of the {analysis.source.positions_text} are "
         f"{'0 in every message' if clock_name == '0' else f'in {clock_name}'}. PX4 expects "
         f"timestamp_sample in microseconds since the autopilot's boot. {fusion_sentence}px4fuse "
         "uses the arrival times, which are late by the latency.",
@@ -238,7 +238,7 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
         initial_latency_s, final_latency_s = position_age_s.quantile([0.05, 0.95]).tolist()
     yield (make_error if is_any_dropped else make_warning)(
         "source_latency_varies",
-        f"The latency of the {analysis.source.positions_phrase} {change_verb} in flight from "
+        f"The latency of the {analysis.source.positions_text} {change_verb} in flight from "
         f"{initial_latency_s:.2f} s to {final_latency_s:.2f} s (time from measurement to arrival)."
         f"{late_drop_sentence}",
         "Find the queue that fills up: sender, bridge or link. Send fewer or smaller messages, and "

@@ -112,7 +112,7 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
             error_text = f" {describe_errors_after_gap(analysis, gap_span_s)}"
         yield make_finding(
             name,
-            f"{len(time_s)} {source.positions_phrase} {fault}. Times: {format_spans(spans)} "
+            f"{len(time_s)} {source.positions_text} {fault}. Times: {format_spans(spans)} "
             f"({total_s:.1f} s in total). KF does not use these positions.{error_text}",
             action or f"{find_source_texts(source).data_link_check} at {start_s:.1f} s.",
             {
@@ -136,7 +136,7 @@ def detect_rounding(analysis: Analysis) -> Findings:
         action += " Subtract a local origin before the conversion from 64-bit to 32-bit floats."
     yield make_warning(
         "source_positions_rounded",
-        f"{source.positions_phrase} are rounded to steps of {step_m:.3g} m.{cause_text} The "
+        f"{source.positions_text} are rounded to steps of {step_m:.3g} m.{cause_text} The "
         f"rounding error is {step_m / 12.0**0.5:.2g} m (1 σ) and correlated in time. "
         f"{NO_ESTIMATES_SENTENCE}",
         action,
@@ -192,7 +192,7 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     subject = f"The {sensor_text} is"
     if rotation_deg:
         subject = (
-            f"{source.positions_phrase} are rotated by {rotation_deg:+.0f}° (clockwise from "
+            f"{source.positions_text} are rotated by {rotation_deg:+.0f}° (clockwise from "
             f"above), and the {sensor_text} is"
         )
         action = f"Rotate the positions by {-rotation_deg:+.0f}° before they are sent. {action}"
@@ -277,7 +277,7 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     yield make_error(
         "source_two_senders",
         f"Two systems alternately send positions that differ by {distance_m:.2f} m. After "
-        f"subtraction of the vehicle's motion, successive {analysis.source.positions_phrase} "
+        f"subtraction of the vehicle's motion, successive {analysis.source.positions_text} "
         f"({rate_hz:.3g} Hz in total) differ by {distance_texts}. {NO_ESTIMATES_SENTENCE}",
         "Send the positions of one system only: stop the second node, bridge or MAVROS plugin.",
         {"distance_m": distance_m, "rate_hz": rate_hz},

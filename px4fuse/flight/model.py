@@ -450,7 +450,7 @@ class PositionTrack:
         return SOURCE_NAMES.get(self.origin.kind, self.origin.kind.upper())
 
     @property
-    def positions_phrase(self) -> str:
+    def positions_text(self) -> str:
         """Name of the positions for users, such as "UWB positions"."""
         if self.origin.kind == "file":
             return "positions from the file"

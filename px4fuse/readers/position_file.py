@@ -277,7 +277,7 @@ def _open_table(
 def _find_increasing_rows(times_s: Array) -> IntArray:
     """Return the indices of the rows with strictly increasing times before 2100."""
     usable_rows = np.flatnonzero(np.abs(times_s) < MAX_VALID_UNIX_TIME_S)
-    # Ranks, because find_longest_increasing_subsequence requires positive values
+    # Replace the times by their ranks: find_longest_increasing_subsequence needs positive integers
     time_ranks = np.unique(times_s[usable_rows], return_inverse=True)[1].astype(np.int64)
     return usable_rows[find_longest_increasing_subsequence(time_ranks + 1)]
 

@@ -31,8 +31,8 @@ MAX_DROPPED_ROW_FRACTION = 0.01
 MAX_DEVIATION_FROM_IDENTITY = 1e-6
 # A motion is planar if its smallest RMS extent ÷ second largest RMS extent is below this ratio
 MAX_SMALLEST_TO_SECOND_EXTENT_RATIO = 1 / 3
-# A motion has a unique plane (is not straight) if its second largest RMS extent ÷ largest RMS
-# extent exceeds this ratio
+# A motion is not straight, so that its plane is unique, if its second largest RMS extent ÷ largest
+# RMS extent exceeds this ratio
 MIN_SECOND_TO_LARGEST_EXTENT_RATIO = 0.1
 # Maximum angle (rad) between the normal of the plane of motion and the y axis of a camera frame
 MAX_TILT_RAD = math.radians(20.0)

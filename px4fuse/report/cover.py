@@ -249,13 +249,13 @@ def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
             rmse_m = effect.position_rmse_m.get(filter_name) if effect else None
             sigmas_m = {label: errors["sigma_m"]}
             plots.append((f"{label} error (m): RMSE", rmse_m, errors["error_m"], sigmas_m))
-    if not plots and isinstance(result.ekf2.state, pd.DataFrame):
-        time_s = result.ekf2.state.index.to_numpy()
+    if not plots and isinstance(result.ekf2_tracks.state, pd.DataFrame):
+        time_s = result.ekf2_tracks.state.index.to_numpy()
         kf_track = predict_track(result.kf_run, time_s)
-        difference_m = kf_track["position_m"] - result.ekf2.state["position_m"]
+        difference_m = kf_track["position_m"] - result.ekf2_tracks.state["position_m"]
         sigmas_m = {
             name: pd.Series(interpolate_sigma(time_s, table, "position_variance_m2"), time_s)
-            for name, table in (("KF", kf_track), ("EKF2", result.ekf2.variance))
+            for name, table in (("KF", kf_track), ("EKF2", result.ekf2_tracks.variance))
         }
         difference_rms_m = effect.difference_rms_m if effect else None
         if difference_m.notna().any():

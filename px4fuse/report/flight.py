@@ -48,7 +48,7 @@ def _draw_enlarged_sigma_plot(page: Page, result: AxisComparison) -> None:
     start_s, end_s = find_zoom_span(result)
     title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
     axes = page.add_panel(title, ENLARGED_PLOT_HEIGHT, caption=_describe_sigma_at_updates(result))
-    ekf2 = result.ekf2
+    ekf2 = result.ekf2_tracks
     for name, tracks in result.tracks.items():
         if run := tracks.run:
             variances_m2 = pd.concat(
@@ -74,7 +74,7 @@ def _draw_enlarged_sigma_plot(page: Page, result: AxisComparison) -> None:
 def find_zoom_span(result: AxisComparison) -> Span:
     """Return the start and end (s) of a few updates in the middle of the flight."""
     candidate_start_times_s = update_times_s = result.kf_run.updates.index.to_numpy()
-    if isinstance(innovations := result.ekf2.innovations, pd.DataFrame) and len(innovations):
+    if isinstance(innovations := result.ekf2_tracks.innovations, pd.DataFrame) and len(innovations):
         candidate_start_times_s = innovations.index.to_numpy()
     start_s = float(candidate_start_times_s[len(candidate_start_times_s) // 2])
     interval_s = np.median(np.diff(update_times_s)) if len(update_times_s) > 1 else 0.0

@@ -66,7 +66,7 @@ def sizes(analysis: Analysis) -> dict[str, InjectedFault]:
     parameters, found = analysis.flight.log.parameters, {}
     assert isinstance(analysis.flight.imu, pd.DataFrame)
     rate_hz = float(1.0 / np.median(np.diff(analysis.flight.imu.index)))
-    innovations = analysis.main.ekf2.innovations
+    innovations = analysis.main.ekf2_tracks.innovations
     rejected = 0.0
     if isinstance(innovations, pd.DataFrame):
         rejected = float((innovations["rejected"] > 0).mean())

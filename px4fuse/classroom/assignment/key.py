@@ -307,7 +307,7 @@ def _find_ekf2_behaviours(
     )
     if size_by_kind.get("ekf2-noise", 0.0) > sigma_z_m:
         required.append("weighted the positions too little")
-    innovations = comparison.main.ekf2.innovations
+    innovations = comparison.main.ekf2_tracks.innovations
     if (
         not isinstance(innovations, Unavailable)
         and (innovations["rejected"] > 0).mean() > MIN_REJECTED_FRACTION

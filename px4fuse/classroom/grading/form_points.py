@@ -30,8 +30,8 @@ FALSE_FAULT_DEDUCTION = 10.0
 ZERO_POINTS_FALSE_FAULT_COUNT = 3
 # Score for the answer that names a fault similar to the injected fault
 SCORE_FOR_SIMILAR_FAULT = 0.4
-# Score for naming a wrong EKF2_EVP_NOISE if the variance reported by the position source is the
-# injected fault: both faults make R wrong
+# Score of a student who names a wrong EKF2_EVP_NOISE, although the injected fault is a wrong
+# variance that the position source reports: both faults make R wrong
 SCORE_FOR_WRONG_NOISE_PARAMETER = 2.0 / 3.0
 # Score for naming a consequence of the injected fault, for example outliers after a jump
 SCORE_FOR_NAMED_CONSEQUENCE = 0.15
