@@ -175,7 +175,7 @@ def test_kf_on_noisy_practice_flight_is_consistent_at_true_noise(level: int, see
 @pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
 def test_too_small_ekf2_gate_rejects_consistent_innovations(level: int, seed: int) -> None:
     found = compared(flown(hidden("ekf2-gate"), level, seed)).main
-    rows = found.ekf2.innovations
+    rows = found.ekf2_tracks.innovations
     assert (rows["rejected"] > 0).mean() > 0.15
     assert found.filters["kf"].verdict == "consistent"
     assert np.mean(_sigmas(found) > 2.0) < 0.1
