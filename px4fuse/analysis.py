@@ -55,12 +55,12 @@ class Analysis(Comparison, Estimates, Reruns):
         return model if isinstance(model, Unavailable) else model.baseline_replay
 
     def select_main_reruns(self) -> list[Rerun]:
-        """Return the re-runs along the main axis that are compared with the original results."""
+        """Return the re-runs along the axis of ``main`` that are compared with the original results."""
         main_axis = self.main.axis.name
         return [rerun for rerun in self.reruns if rerun.axis == main_axis and rerun.is_logged]
 
     def select_secondary_axes(self) -> list[AxisComparison]:
-        """Return the comparisons along all axes except the main axis."""
+        """Return the comparisons along all axes except that of ``main``."""
         return [axis for axis in self.axes.values() if axis is not self.main]
 
 

@@ -356,7 +356,7 @@ def run_what_if(
         if sweep.parameter in changes:
             raise SettingsError(
                 f"{sweep.parameter} has both a new value and a sweep.",
-                "Give one of them.",
+                "Use --set or --sweep, not both.",
             )
     comparison_request = ComparisonRequest(log=request.log, system=request.system)
     flight = flight or read_flight(comparison_request, progress)

@@ -182,7 +182,7 @@ def axis(name: str = "north", **parts: Any) -> Any:
         for key in FILTER_NAMES
     }
     axis = SimpleNamespace(
-        name=name, label="the main axis" if name == "aisle" else name,
+        name=name, label="the axis of largest motion" if name == "aisle" else name,
         measurement_time_s=np.arange(0.0, 120.0), measurement_m=np.zeros(120),
     )  # fmt: skip
     return SimpleNamespace(

@@ -241,5 +241,6 @@ def test_diagnosis_explains_differing_nis_and_nees_verdicts() -> None:
     )
     assert card.reconcile == (
         "The first fault on this card hardly changes the innovations of EKF2, but it increases "
-        "the errors against ground truth. The re-run without this fault reduces the position error."
+        "the errors against ground truth. A re-run without the first fault reduces the position "
+        "error."
     )

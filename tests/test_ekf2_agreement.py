@@ -99,7 +99,7 @@ def agreeing(
     (agreeing(0.949), 0.0, 0.04, False, "a correlation of 0.9490, below"),
     # with many rejections, shares and NIS decide
     (agreeing(0.5), 0.1, 0.06, True, "rejected 6.0% of the samples, EKF2 rejected 10.0%"),
-    (agreeing(0.5), 0.06, 0.1, True, "single innovations are not compared"),
+    (agreeing(0.5), 0.06, 0.1, True, "innovations are not compared one by one"),
     (agreeing(0.5), 0.25, 0.19, False, "limits "),
     (agreeing(0.5), 0.125, 0.1875, False, "limits "),
     (agreeing(0.5, nis=1.25), 0.1, 0.1, True, "mean NIS differs by 25%"),

@@ -177,7 +177,7 @@ def test_grade_keeps_first_report_if_later_one_needs_review() -> None:
     (ada, _), _ = make_grades(files)
     assert ada.total == 9.0
     assert [one.submission for one in ada.other_reports] == ["z.pdf"]
-    assert ada.flags == ("The file z.pdf does not count: it is pending.",)
+    assert ada.flags == ("The file z.pdf does not count for the grade: it is pending.",)
     waiting = replace(
         files["a.pdf"].items[0], is_awaiting_points=True
     )  # waits for the points of the notes
@@ -342,7 +342,7 @@ def test_instructor_overrides_csv_accepts_decimal_commas(tmp_path) -> None:
         ("1,A,-1,", "must be a number of 0 or more"),
         ("1,A,nan,", "must be a number of 0 or more"),
         ("1,A,1_5,", "must be a number of 0 or more"),
-        ("1,,5,", "the points have no item: write a rubric title or 'total' as item"),
+        ("1,,5,", "the row has points but no item: write a rubric title or 'total' as item"),
         ("1,A,5,\n1,A,6,", "student 1 has two rows for the item A"),
     ],
 )

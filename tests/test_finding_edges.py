@@ -274,7 +274,7 @@ def rejected(count: int, of: int) -> pd.DataFrame:
 def test_severity_of_rejections_depends_on_rejected_percentage(
     count: int, of: int, expected: str | None
 ) -> None:
-    """EKF2 rejects the horizontal vector, so the main axis is used."""
+    """EKF2 rejects the horizontal vector, so the axis of largest motion is used."""
     axes = (
         axis("north", ekf2_innovations=rejected(count, of)),
         axis("east", ekf2_innovations=rejected(9, 9)),

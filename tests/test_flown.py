@@ -71,10 +71,10 @@ FLIGHTS = {
         offset_s=-0.25,
         # correct timestamps at the sender or set the delay: either corrects the error
         reruns=(
-            ("KF, corrected time offset", (about(0.24), about(0.070)), (about(0.99), about(0.93))),
+            ("KF, time offset corrected", (about(0.24), about(0.070)), (about(0.99), about(0.93))),
             ("EKF2 (replay), EKF2_EV_DELAY 264, EKF2_DELAY_MAX 300", (about(0.33), about(0.080)),
              (about(1.22), about(0.95))),
-            ("EKF2 (replay), corrected time offset", (about(0.33), about(0.074)),
+            ("EKF2 (replay), time offset corrected", (about(0.33), about(0.074)),
              (about(1.22), about(0.95))),
         ),
         console=("param set EKF2_EV_DELAY 264", "param set EKF2_DELAY_MAX 300", "reboot"),

@@ -43,7 +43,7 @@ def test_parameter_change_with_larger_later_error_is_a_warning() -> None:
     flight = replace(flight, ekf2=replace(flight.ekf2, state=state))
     changed = found(with_change(flight, "EKF2_EV_DELAY", 0.0, 200.0))
     assert changed.severity == "warning"
-    assert "EKF2's position RMSE along the main axis is 0.0" in changed.message
+    assert "EKF2's position RMSE along the axis of largest motion is 0.0" in changed.message
 
 
 def test_replay_ignores_change_of_parameter_that_it_does_not_use() -> None:

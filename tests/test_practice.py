@@ -90,7 +90,7 @@ def compared(flight: Flight, **settings: float) -> Comparison:
 
 
 def kf_statistics(flight: Flight, **settings: float) -> Any:
-    """Return the consistency statistics of KF along the main axis."""
+    """Return the consistency statistics of KF along the axis of largest motion."""
     return compared(flight, **settings).main.filters["kf"]
 
 

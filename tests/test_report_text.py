@@ -250,10 +250,10 @@ def test_report_omits_time_offset_page_if_not_significant() -> None:
          {"Result": "0.250 s early", "PX4": "cannot be negative"}),
         ({"offset_s": 0.009, "interval_s": (0.008, 0.0095)}, 0.0,
          {"Result": "too small for a correction: the limit is 0.036 s",
-          "Offset": "The estimate is"}),
+          "Offset": "The estimated time offset is"}),
         ({"offset_s": -0.25, "interval_s": (-0.28, -0.22)}, 0.0,
-         {"PX4": "250 ms (now 0 ms), or correct the sender's clock. In addition to "
-          "either correction, set EKF2_DELAY_MAX to 300 ms."}),
+         {"PX4": "250 ms (now 0 ms), or correct the sender's clock. In both cases, "
+          "also set EKF2_DELAY_MAX to 300 ms."}),
         ({"change_p_value": 0.001}, 0.0, {"Changes": "+0.00 s from 10 s"}),
         ({"drift_ppm": 1000.0}, 0.0, {"Drift": "+1000 ± 588 ppm (95 %)."}),
         ({"drift_ppm": 100.0}, 0.0, {"Drift": "not significant"}),

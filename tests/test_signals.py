@@ -359,7 +359,7 @@ def test_height_reset_is_kept_if_source_has_no_height():
     assert "removed" in remove_origin_resets(ekf2, track, WHOLE)[1]
     state, statement = remove_origin_resets(ekf2, blind, WHOLE)
     pd.testing.assert_frame_equal(state, ekf2.state)
-    assert statement == "Jumps by EKF2 resets (1 of height) are kept: they correct an error of EKF2"
+    assert statement == "Jumps by EKF2 resets (1 of height) are kept: the resets correct an error of EKF2"
 
 
 @pytest.mark.parametrize(("reset_s", "said"), [
@@ -375,7 +375,9 @@ def test_ekf2_resets_outside_evaluated_segment_are_not_removed(reset_s, said):
     assert bool(said) == bool(statement)
 
 
-def test_axis_aisle_is_called_main_axis_in_messages() -> None:
+def test_axis_label_states_largest_motion_or_heading() -> None:
     flight = aisle_flight()
     labels = {axis.name: axis.label for axis in make_axes(flight, flight.positions[0], ALL)}
-    assert (labels["north"], labels["aisle"]) == ("north", "the main axis")
+    assert (labels["north"], labels["aisle"]) == ("north", "the axis of largest motion")
+    *_, aisle = make_axes(flight, flight.positions[0], ALL, heading_deg=10.0)
+    assert aisle.label == "the axis of --heading"

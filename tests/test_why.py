@@ -126,8 +126,8 @@ def test_report_without_ekf2_replay_omits_difference_page(sample: Analysis) -> N
 @pytest.mark.parametrize(
     ("share", "text"),
     [
-        (0.47, "decreases by 47 %."),
-        (1.4, "decreases by 140 % of its value without replacements. Other replaced"),
+        (0.47, "decreases by 47 % of its original value."),
+        (1.4, "decreases by 140 % of its original value. Other replaced"),
     ],
 )
 def test_kf_ekf2_difference_text_names_largest_contribution(sample, share, text) -> None:

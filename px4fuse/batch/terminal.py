@@ -105,7 +105,7 @@ def format_differences(results: ChangeResults) -> Page:
     for text in results.worse:
         page.write_labelled("Worse", styled_text(text, ERROR_COLOUR))
     if not results.worse:
-        page.write("B contains no inconsistent filter and no error that A does not contain.")
+        page.write("Each error and each inconsistent filter of B is also in A.")
     return page
 
 

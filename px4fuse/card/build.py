@@ -86,8 +86,8 @@ OUTLIER_EXPLANATION = (
     "affect EKF2's position."
 )
 UNEXPLAINED_DIFFERENCE_TEXT = (
-    "For KF or EKF2, actual ÷ reported σ differs between innovations and ground truth. No re-run "
-    "explains the difference."
+    "For KF or EKF2, the ratios actual ÷ reported σ of innovations and against ground truth are "
+    "different. No re-run of the filters explains the difference."
 )
 # Reasons why faults of the source increase errors, but hardly change innovations
 SOURCE_FAULT_EXPLANATIONS = (
@@ -264,7 +264,7 @@ def _summarise_errors(analysis: Analysis) -> FlightErrors:
 
 
 def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
-    """Describe the direction of an axis, for example "along the main axis, 30° from north"."""
+    """Describe the direction of an axis, for example "along the axis of largest motion, 30° from north"."""
     direction, heading, source = f"along {result.axis.label}", result.heading_deg, analysis.source
     if result.axis.name != AISLE or heading is None:
         return direction
@@ -304,14 +304,8 @@ def _describe_effect(
         span_text = ""
         if max(segment.start_s - flight.start_s, flight.end_s - segment.end_s) > MIN_GAP_S:
             span_text = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s"
-        is_axis_along_motion = (
-            analysis.main.axis.name == AISLE
-            and analysis.request is not None
-            and analysis.request.heading_deg is None
-        )
-        axis_text = " (axis of largest motion)" if is_axis_along_motion else ""
         sentences.append(
-            f"Position RMSE along {analysis.main.axis.label}{axis_text}{span_text}: "
+            f"Position RMSE along {analysis.main.axis.label}{span_text}: "
             f"{_format_lengths(effect.position_rmse_m)}."
         )
         if effect.horizontal_rmse_m:
@@ -327,7 +321,7 @@ def _describe_effect(
         not effect.position_rmse_m
         or all(verdict.word == "consistent" for verdict in sigma_verdicts)
     ):
-        sentences.append(f"{_format_difference(effect.difference_rms_m)}.")
+        sentences.append(f"{_format_difference(effect.axis, effect.difference_rms_m)}.")
     if not effect.position_rmse_m:
         sentences.append(
             "The log has no ground truth, so the position errors of KF and EKF2 are unknown."
@@ -361,8 +355,9 @@ def _describe_worst_axis(analysis: Analysis) -> list[str]:
     ]
 
 
-def _format_difference(rms_m: float) -> str:
-    return f"RMS position difference KF − EKF2 along the main axis: {format_metres(rms_m)} m"
+def _format_difference(axis_text: str, rms_m: float) -> str:
+    direction = axis_text.partition(",")[0]
+    return f"RMS position difference KF − EKF2 {direction}: {format_metres(rms_m)} m"
 
 
 def _format_lengths(length_by_filter_m: Mapping[FilterName, float]) -> str:
@@ -509,7 +504,7 @@ def _explain_differing_verdicts(
         filter_labels = " and ".join(FILTER_NAMES[name] for name in filters_with_differing_ratios)
         return (
             f"The first fault on this card hardly changes the innovations of {filter_labels}, but "
-            "it increases the errors against ground truth. The re-run without this fault reduces "
+            "it increases the errors against ground truth. A re-run without the first fault reduces "
             "the position error."
         )
     if analysis.source.origin.may_drift:
@@ -533,7 +528,7 @@ def _explain_differing_verdicts(
 def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCause]) -> str:
     if effect.difference_rms_m is None or not ranked_causes:
         return ""
-    difference_text = _format_difference(effect.difference_rms_m)
+    difference_text = _format_difference(effect.axis, effect.difference_rms_m)
     reruns = ranked_causes[0].reruns
     filters_affected_by_fault = {
         rerun.filter

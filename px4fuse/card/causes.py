@@ -44,9 +44,9 @@ MIN_REJECTED_FRACTION_TO_SHOW = 0.005
 TARGET_BY_ADJUSTABLE_FILTER: Mapping[FilterName, ActionTarget] = {"kf": "KF", "ekf2": "EKF2"}
 # Label of a re-run with corrected data, by kind of change
 CORRECTION_TEXTS = {
-    "time offset": "corrected time offset",
-    "rotation": "corrected rotation",
-    "bias": "corrected accelerometer bias",
+    "time offset": "time offset corrected",
+    "rotation": "rotation corrected",
+    "bias": "accelerometer bias corrected",
 }
 # Device or filter that the user must change, by group of the finding
 ACTION_TARGET_BY_GROUP: Mapping[str, ActionTarget] = {

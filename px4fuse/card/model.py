@@ -75,7 +75,7 @@ class FlightErrors(Record, kw_only=True):
     Attributes
     ----------
     axis : str
-        Evaluated axis, for example "along the main axis, 30° from north".
+        Evaluated axis, for example "along the axis of largest motion, 30° from north".
     position_rmse_m : mapping
         Position RMSE of each filter against ground truth along ``axis``.
     horizontal_rmse_m : mapping

@@ -32,7 +32,7 @@ def explore(log: Path | None, output: Path | None, **option_values: Any) -> None
     )
     with outputs.progress(page_path) as show_progress:
         analysis = diagnose(request, show_progress)
-        show_progress("writing the page")
+        show_progress("writing the web page")
         # a slow import (Bokeh), which is not needed if the analysis fails
         from px4fuse.explore.page import make_analysis_page
 

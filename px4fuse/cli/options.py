@@ -123,7 +123,7 @@ timeout_option = click.option(
     type=click.FloatRange(1.0),
     metavar="SECONDS",
     default=LOG_ANALYSIS_TIMEOUT_S,
-    help="Maximum time for one log (s).",
+    help="Maximum time to analyse one log (s).",
 )
 #: Option --memory of commands that analyse logs in worker processes
 memory_option = click.option(
@@ -319,8 +319,7 @@ filter_options = _combine_options(
     ),
     _comparison_option(
         "heading_deg",
-        "Heading (°, clockwise from north) of the main axis.  [default: main direction of the "
-        "track]",
+        "Heading (°, clockwise from north) of the axis aisle.  [default: axis of largest motion]",
     ),
     _comparison_option(
         "start_s",

@@ -110,7 +110,7 @@ class CommandWithFaultTable(click.Command):
     "--kind",
     type=Choice((*get_args(ScenarioKind), MIXED_KIND)),
     default=_DEFAULT_SCENARIO.kind,
-    help="aisle: passes along an aisle with UWB; loop: laps of a square with drifting VIO; "
+    help="aisle: passes along a straight path with UWB; loop: laps of a square with drifting VIO; "
     "outdoor: laps of a square with GNSS; mixed (with --assignment): loop for one third of the "
     "students, aisle for the others.",
 )
@@ -142,7 +142,7 @@ class CommandWithFaultTable(click.Command):
     "--passes",
     type=int,
     metavar="N",
-    help="Number of passes of the aisle, or laps of the square.  [default: 6 passes, 1 lap; "
+    help="Number of passes of the straight path, or laps of the square.  [default: 6 passes, 1 lap; "
     "outdoors 3 laps]",
 )
 @click.option(

@@ -56,7 +56,7 @@ def verify(
             raise LogError(
                 "The folders given as LOG contain no files. Give the flight log or its folder."
             )
-        show_progress("repeating the analysis")
+        show_progress("repeating the analysis of the report")
         verification = run_one_with_limits(
             partial(verify_report, pdf=content, path_by_sha256=file_by_sha256),
             recorded_results,

@@ -114,7 +114,7 @@ def find_main_axis_changes(
     axis: str,
     summary: FilterSummary,
 ) -> list[Change]:
-    """Return the changes of settings or data for re-runs along the main axis."""
+    """Return the changes of settings or data for re-runs along the axis of largest motion."""
     changes = remove_repeated_changes(
         change
         for statistic in CONSISTENCY_STATISTICS[::-1]

@@ -71,7 +71,7 @@ def _compare_axis(
     prepared_comparison: PreparedComparison, ekf2: Ekf2 | Unavailable, axis: Axis, *, is_main: bool
 ) -> AxisComparison:
     segment = prepared_comparison.segment
-    # Only the main axis, which the report shows step by step, needs filterpy
+    # Only the axis of largest motion, which the report shows step by step, needs filterpy
     kf_run = run_kf(axis, prepared_comparison.settings, fast=not is_main)
     ekf2_tracks, truth = tracks_and_truth = project_tracks(prepared_comparison, ekf2, axis, segment)
     tracks: dict[FilterName, FilterTracks] = {"kf": make_run_tracks(kf_run), "ekf2": ekf2_tracks}

@@ -153,7 +153,7 @@ def add_cause_sentences(
     ----------
     explanation : DifferenceExplanation
     axis_label : str
-        Name of the axis, for example "the main axis".
+        Name of the axis, for example "north".
     reason_by_property_name : mapping from str to str
         Text for each possible cause, for example the measurement noise.
     """
@@ -169,16 +169,17 @@ def add_cause_sentences(
     first, second, *_ = sorted(
         explanation.steps, key=lambda replacement: -replacement.position_mean_square_m2
     )
-    causes = [(f"Largest contribution to the difference KF - EKF2 along {axis_label}", first)]
+    causes = [("Largest", first)]
     min_contribution_m2 = MIN_CONTRIBUTION_FRACTION * explanation.position_mean_square_m2
     if second.position_mean_square_m2 >= min_contribution_m2:
-        causes.append(("Second largest contribution", second))
+        causes.append(("Second largest", second))
     for rank_text, replacement in causes:
         reason = reason_by_property_name[replacement.name]
         if replacement.name == steps.REJECTION_PROPERTY:
             reason += _describe_rejections(explanation)
         sentences.append(
-            f"{rank_text}: {replacement.name}. {reason}. "
+            f"{rank_text} contribution to the difference KF - EKF2 along {axis_label}: "
+            f"{replacement.name}. {reason}. "
             f"{_describe_replacement_effect(replacement, explanation)}"
         )
     sentences += [_describe_unexplained_fractions(explanation), *_describe_rmse(explanation)]
@@ -199,16 +200,14 @@ def _describe_replacement_effect(
     replacement: PropertyReplacement, explanation: DifferenceExplanation
 ) -> str:
     explained_fraction = replacement.position_mean_square_m2 / explanation.position_mean_square_m2
-    more_than_all_text = ""
+    increase_text = ""
     if explained_fraction > 1.0:
-        more_than_all_text = (
-            " of its value without replacements. Other replaced properties increase the difference"
-        )
+        increase_text = " Other replaced properties increase the difference."
     return (
         f"If KF uses EKF2's {replacement.name}, KF's position changes by up to "
         f"{replacement.position_moved_m:.2f} m (at {replacement.moved_at_s:.1f} s), and the mean "
-        f"square difference KF - EKF2 decreases by {100 * explained_fraction:.0f} %"
-        f"{more_than_all_text}."
+        f"square difference KF - EKF2 decreases by {100 * explained_fraction:.0f} % "
+        f"of its original value.{increase_text}"
     )
 
 

@@ -50,7 +50,7 @@ MIN_TELEMETRY_IMU_HZ = 200.0
 MIN_MEASURED_TO_NOMINAL_IMU_RATE_RATIO = 0.98
 IMU_OSCILLATES = Unavailable(
     "low-pass filter of the position source",
-    "the accelerometer oscillates, which resembles filtered positions",
+    "the measured acceleration oscillates, so unfiltered positions also look filtered",
     "Check the mounting of the autopilot.",
 )
 TELEMETRY_IMU_MESSAGES = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
@@ -317,7 +317,7 @@ def _select_horizontal_axes(
     return Unavailable(
         "systematic and time-correlated errors of the position source",
         "the position and acceleration noise of the horizontal axes could not be estimated",
-        "Analyse the axes north and east, or the main axis (--axis aisle).",
+        "Analyse the axes north and east, or the axis of largest motion (--axis aisle).",
     )
 
 

@@ -256,7 +256,7 @@ class Comparison(PreparedComparison):
 
     @property
     def main(self) -> AxisComparison:
-        """Result along the main axis (largest motion) if analysed, else along the first axis."""
+        """Result along the axis of largest motion if analysed, else along the first axis."""
         return self.axes.get(AISLE) or next(iter(self.axes.values()))
 
 

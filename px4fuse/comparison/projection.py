@@ -55,8 +55,8 @@ def remove_origin_resets(
         reset for reset in ekf2.resets if segment.start_s < reset.time_s <= segment.end_s
     ]
     state = ekf2.state.copy() if resets_in_segment else ekf2.state
-    removed = "removed from EKF2's track: they only move the origin of EKF2's frame"
-    kept = "kept: they correct an error of EKF2"
+    removed = "removed from EKF2's track: the resets only move the origin of EKF2's frame"
+    kept = "kept: the resets correct an error of EKF2"
     texts_by_reset_treatment: dict[str, list[str]] = {removed: [], kept: []}
     for label, quantity, columns in (
         ("horizontal position", "position", Columns.POSITION[:2]),

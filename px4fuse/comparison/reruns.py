@@ -115,7 +115,7 @@ class Reruns:
     difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
         Causes of the difference KF - EKF2.
     reruns : tuple of Rerun
-        Re-runs along the main axis, and along each axis with an inconsistent filter.
+        Re-runs along the axis of largest motion, and along each axis with an inconsistent filter.
     """
 
     ekf2_model: Ekf2Model | Unavailable

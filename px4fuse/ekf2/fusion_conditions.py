@@ -363,10 +363,10 @@ def _check_gnss(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     for bit in failed_bits[:3]:
         name, parameter, unit = GNSS_CHECKS[bit]
         failed_percent = 100.0 * failed_fraction_by_bit[bit]
-        text = f"{name} (check failed {failed_percent:.0f} % of the time"
+        limit_text = ""
         if parameter in parameters:
-            text += f", limit {parameter} {parameters[parameter]:g}{unit}"
-        check_texts.append(f"{text})")
+            limit_text = f", limit {parameter} {parameters[parameter]:g}{unit}"
+        check_texts.append(f"{name} (failed {failed_percent:.0f} % of the time{limit_text})")
     yield UnmetCondition(
         "checks",
         f"GNSS fails EKF2's check of the {GNSS_CHECKS[failed_bits[0]][0]}",

@@ -557,8 +557,8 @@ def _judge_agreement(
         )
     return (
         True,
-        f"{rejection_text}; single innovations are not compared, because each rejection changes "
-        "the later innovations",
+        f"{rejection_text}; replayed and logged innovations are not compared one by one, because "
+        "each rejection changes the later innovations",
     )
 
 

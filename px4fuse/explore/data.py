@@ -265,7 +265,7 @@ def _format_ekf2_settings(analysis: Analysis) -> dict[str, str]:
 
 
 def _make_command(request: ComparisonRequest, analysis: Analysis) -> str:
-    """Return the ``px4fuse compare`` command with time span and main axis of this analysis.
+    """Return the ``px4fuse compare`` command with time span and heading of this analysis.
 
     The settings of KF are omitted; the web page appends them.
     """

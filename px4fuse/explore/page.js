@@ -241,7 +241,7 @@ const Explore = (async () => {
       .filter(([, value]) => Number.isFinite(value)).map(([filter, value]) => `${filter} ${format(value)}`).join(", ");
     title("innovation", `innovations outside ±2√S (expected 5 %): ${both("outside", (x) => `${(100 * x).toFixed(0)} %`)}`);
     const rms = axis.truth ? `against ground truth, RMSE ${both("rmse", Card.formatMetres)}`
-      : `KF − EKF2, RMS ${both("differenceRms", Card.formatMetres)}`;
+      : `position difference KF − EKF2, RMS ${both("differenceRms", Card.formatMetres)}`;
     title("error", `${rms} · shaded: ±2σ reported by KF, hatched: gap in the position source`);
   }
 

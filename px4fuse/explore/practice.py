@@ -50,7 +50,7 @@ SCENARIO_SETTINGS: dict[str, Any] = {
     "tilt_error_deg": 0.02,
     "yaw_error_deg": 0.2,
 }
-# Range of the random length (m) of a pass along the aisle
+# Range of the random length (m) of a pass along the straight path
 AISLE_LENGTH_RANGE_M = (8.0, 12.0)
 # Id of the finding that detects an injected fault, by name of the fault
 FINDING_ID_BY_FAULT = {

@@ -1,6 +1,6 @@
 """Positions and acceleration of a flight along the axes north, east, down and aisle.
 
-The aisle is the main horizontal direction of the flight. The acceleration in NED is R(q) · specific
+The aisle is the horizontal axis of largest motion. The acceleration in NED is R(q) · specific
 force + [0, 0, g] (Groves 2013, eq. 5.52 without earth rate).
 """
 
@@ -35,6 +35,8 @@ from px4fuse.trajectory.rotation import interpolate, rotate, to_matrix
 
 # Name of the axis along the main horizontal direction of the flight
 AISLE = "aisle"
+# Note of this axis if the user gives its heading
+HEADING_NOTE = "heading chosen with --heading"
 # Minimum length (s) of an IMU gap
 MIN_IMU_GAP_S = 0.1
 # Minimum length of an IMU gap, as multiple of the median sample interval
@@ -139,8 +141,10 @@ class Axis:
 
     @property
     def label(self) -> str:
-        """Name of the axis in messages: north, east, down, or "the main axis" for "aisle"."""
-        return "the main axis" if self.name == AISLE else self.name
+        """Name of the axis in messages, for example "north" or "the axis of largest motion"."""
+        if self.name != AISLE:
+            return self.name
+        return f"the axis of {'--heading' if self.note == HEADING_NOTE else 'largest motion'}"
 
 
 def imu_and_attitude(flight: Flight) -> tuple[pd.DataFrame, pd.DataFrame] | Unavailable:
@@ -317,7 +321,7 @@ def _choose_axis_direction(
     if name != AISLE:
         axis_index = AXIS_NAMES.index(name)
         return np.eye(3)[axis_index], (None if name == "down" else 90.0 * axis_index), ""
-    note = "heading chosen with --heading"
+    note = HEADING_NOTE
     if heading_deg is None:
         heading_deg, elongation = estimate_aisle_heading(track, segment)
         note = f"main direction of the track (ratio of length to width: {elongation:.1f})"

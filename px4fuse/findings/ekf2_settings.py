@@ -229,12 +229,14 @@ def detect_parameter_changes(analysis: Analysis) -> Findings:
             has_effect |= _differ_by_min_factor(nis_before.sigma_ratio, nis_after.sigma_ratio)
             effect_sentences = (
                 f" EKF2 is {_format_verdict(nis_before)} before the change and "
-                f"{_format_verdict(nis_after)} after (innovations along the main axis)."
+                f"{_format_verdict(nis_after)} after (innovations along "
+                f"{analysis.main.axis.label})."
             )
         if _differ_by_min_factor(rmse_before_m, rmse_after_m):
             has_effect = True
             effect_sentences += (
-                f" EKF2's position RMSE along the main axis is {format_metres(rmse_before_m)} m "
+                f" EKF2's position RMSE along {analysis.main.axis.label} is "
+                f"{format_metres(rmse_before_m)} m "
                 f"before and {format_metres(rmse_after_m)} m after the change."
             )
         action = (

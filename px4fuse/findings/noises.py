@@ -69,7 +69,7 @@ MAX_RATIO_OF_EQUAL_NOISES = 1.25
 # ratio
 MIN_USED_TO_PARAMETER_NOISE_RATIO = 1.25
 UNEXPLAINED_SIGMA_ACTION = (
-    "No re-run made the filter's σ consistent. Check the IMU (rate, gaps, vibration)."
+    "No tested change of data or settings makes the filter's σ consistent. Check the IMU (rate, gaps, vibration)."
 )
 UNKNOWN_NOISE_ACTION = "The noise could not be estimated; px4fuse tune LOG states the reason."
 NO_IMPROVEMENT_ACTION = (
@@ -369,7 +369,7 @@ def _format_noise_minimum(analysis: Analysis) -> str:
         and (reported_noise_m := _find_reported_noise_m(analysis)) >= gnss_noise_m
     ):
         return (
-            "Change nothing: the noise of GNSS positions in PX4 is at least the noise that the "
+            "Change nothing: EKF2 never assumes a GNSS position noise below the noise that the "
             f"receiver reports ({reported_noise_m:.2g} m)."
         )
     if (

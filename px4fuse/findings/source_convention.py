@@ -268,7 +268,7 @@ def _detect_orientation_faults(
         )
         return
     agreement_text = (
-        "After correction, roll and pitch agree with the autopilot (median difference "
+        "With the corrected orientation, roll and pitch agree with the autopilot (median difference "
         f"{orientation.tilt_difference_deg:.1f}°)"
     )
     fault_text, action = {

@@ -189,17 +189,16 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     if source.alignment is not None:  # no EKF2 parameter corrects positions of a file
         sensor_text = "sensor"
         action = "Subtract this lever arm, rotated to NED by the attitude, from the positions."
-    subject = f"The {sensor_text} is"
+    rotation_sentence = ""
     if rotation_deg:
-        subject = (
-            f"{source.positions_text} are rotated by {rotation_deg:+.0f}° (clockwise from "
-            f"above), and the {sensor_text} is"
+        rotation_sentence = (
+            f"{source.positions_text} are rotated by {rotation_deg:+.0f}° (clockwise from above). "
         )
         action = f"Rotate the positions by {-rotation_deg:+.0f}° before they are sent. {action}"
     yield make_warning(
         "source_lever_arm",
-        f"{subject} mounted {np.hypot(forward_m, right_m):.2f} m from the mounting "
-        f"point that EKF2 assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m right (± "
+        f"{rotation_sentence}The {sensor_text} is mounted {np.hypot(forward_m, right_m):.2f} m "
+        f"from the mounting point that EKF2 assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m right (± "
         f"{1.96 * sigma_m:.2f} m, 95 %). When the vehicle turns, {error_text} changes by up to "
         f"twice this distance. {effect_sentence}{NO_ESTIMATES_SENTENCE}",
         f"{action} Measure the position of the sensor relative to the IMU.",

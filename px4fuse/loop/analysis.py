@@ -175,7 +175,7 @@ def _find_true_end(
         if not request.closed_loop:
             raise SettingsError(
                 "`landed_at` and `closed_loop` exclude each other.",
-                "Omit one of them.",
+                "Omit --landed-at or --open.",
             )
         return loop_segment.convert_measured_final_pose(path, request.landed_at)
     if not request.closed_loop:

@@ -125,7 +125,7 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
             tagged.raise_where(
                 np.ones(len(tagged.lines), bool),
                 "the file contains 2D entries (SE2) and 3D entries (SE3)",
-                "Keep only the 2D or only the 3D entries.",
+                "Keep only the 2D or only the 3D entries of the file.",
             )
     vertices, edges = lines_by_tag[f"VERTEX_{pose_type}"], lines_by_tag[f"EDGE_{pose_type}"]
     if not edges.lines:

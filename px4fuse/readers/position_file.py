@@ -483,7 +483,7 @@ def _choose_time_unit(
     for unit, unit_s in SECONDS_BY_TIME_UNIT.items():
         is_unix = MIN_VALID_UNIX_TIME_S <= median_time * unit_s < MAX_VALID_UNIX_TIME_S
         if is_unix and median_step * unit_s <= MAX_UNIX_TIME_INTERVAL_S:
-            return unit, "in this unit, the timestamps are UNIX times between 2000 and 2100"
+            return unit, f"in {unit}, the timestamps are UNIX times between 2000 and 2100"
         if unit in units and interval_range_s[0] <= median_step * unit_s <= interval_range_s[1]:
             plausible_units.append(unit)
     if not plausible_units:
@@ -493,7 +493,7 @@ def _choose_time_unit(
         )
     unit, *other_units = plausible_units
     interval_s = median_step * SECONDS_BY_TIME_UNIT[unit]
-    reason = f"in this unit, the median interval of the positions is {interval_s:.3g} s"
+    reason = f"in {unit}, the median interval of the positions is {interval_s:.3g} s"
     if other_units:
         reason += f"; if the unit is {other_units[0]}, give --position-time-unit"
     return unit, reason

@@ -84,12 +84,12 @@ def make_time_offset_advice(
                 f"{format_metres(rerun.before.position_rmse_m or 0.0)} to "
                 f"{format_metres(rerun.after.position_rmse_m or 0.0)} m."
             ),
-            "Offset": f"The estimate is {offset_text}.",
+            "Offset": f"The estimated time offset is {offset_text}.",
             "Action": "Check the timestamps of the ground truth, not of the positions.",
         }
     advice_by_label = {
         "Result": "The position source has no significant time offset.",
-        "Offset": f"The estimate is {offset_text}.",
+        "Offset": f"The estimated time offset is {offset_text}.",
     }
     if time_offset.is_significant(offset_s):
         late_or_early = "late" if offset_s < 0.0 else "early"
@@ -147,7 +147,7 @@ def _format_delay_advice(
         "ms), or correct the sender's clock."
     )
     if delay_max_change := find_delay_max_change(comparison, fitted_delay_ms):
-        text += f" In addition to either correction, set {format_changes(delay_max_change)}."
+        text += f" In both cases, also set {format_changes(delay_max_change)}."
     return text
 
 
@@ -164,8 +164,8 @@ def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]
     )
     page.write_labelled_texts(make_time_offset_advice(analysis, time_offset))
     caption = (
-        f"Likelihood of {time_offset.count} measurements. The 95 % interval includes "
-        "the IMU noise, the curve does not."
+        f"Likelihood of the time offset from {time_offset.count} measurements. The 95 % interval "
+        "includes the IMU noise, but the curve does not."
     )
     title = "Decrease of the log-likelihood below its maximum (nats)"
     _draw_likelihood(page.add_panel(title, CURVE_HEIGHT, caption=caption), time_offset)

@@ -55,7 +55,7 @@ InnovationsByFilter = Mapping[str, "pd.Series[float]"]
 
 
 def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the consistency tests of the main axis, and a table of all axes."""
+    """Draw the consistency tests along one axis, and a table of all axes."""
     result = analysis.main
     axis_text = result.axis.label
     page = Page(
@@ -115,9 +115,9 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     column_heads = ["filter", "change", "quantity", "as flown", "with change", "explains"]
     page.add_table(column_heads, rows, right_aligned_columns=(3, 4))
     page.write_muted_text(
-        "Each row is a re-run with one change. 'explains': relative reduction of ln(mean NIS) or "
-        "ln(mean NEES), which is 0 for a consistent filter; 'all': the filter becomes consistent. "
-        "A change that explains 50 % or more is a cause."
+        "Each row is a re-run with one change. 'explains' is the relative reduction of ln(mean "
+        "NIS) or ln(mean NEES). 'all' means that the filter becomes consistent. A change that "
+        "explains 50 % or more is a cause."
     )
 
 

@@ -337,7 +337,7 @@ def _rotate_map_tracks(analysis: Analysis) -> tuple[dict[str, Array], tuple[str,
         heading_rad = np.deg2rad(aisle_heading_deg % 180.0)
         labels = f"along {analysis.main.axis.label}", "left"
     elif analysis.source.frame == "FRD":
-        labels = "y of the position source", "x"
+        labels = "y axis of the position source", "x axis"
     cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
     rotation = np.array([[cosine, sine], [sine, -cosine]])
     return {name: rotation @ track for name, track in _select_map_tracks(analysis).items()}, labels

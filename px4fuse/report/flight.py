@@ -20,7 +20,7 @@ ENLARGED_PLOT_HEIGHT = 125.0  # points
 
 
 def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw position and velocity along the main axis over time."""
+    """Draw position and velocity along the axis of largest motion over time."""
     result = analysis.main
     page = Page(f"Position and velocity along {result.axis.label}")
     panels.add_legend(page, analysis)
@@ -31,7 +31,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw innovations and σ along the main axis over time."""
+    """Draw innovations and σ along the axis of largest motion over time."""
     result = analysis.main
     page = Page(f"Innovations and variances along {result.axis.label}")
     panels.INNOVATIONS_PANEL.draw_on_page(page, analysis, result, with_time_label=False)
@@ -99,7 +99,7 @@ def _describe_sigma_at_updates(result: AxisComparison) -> str:
 
 
 def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw position, velocity, innovations and σ along the axes except the main axis."""
+    """Draw position, velocity, innovations and σ along the other axes."""
     secondary_axes = analysis.select_secondary_axes()
     if not secondary_axes:
         return

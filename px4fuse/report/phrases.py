@@ -71,7 +71,7 @@ VERDICT_TABLE_HEAD = ("axis", "filter", "mean NIS", "95 % band", "verdict")
 def make_verdict_row(result: AxisComparison, name: str) -> list[Cell]:
     """Return the table row on the consistency of a filter along an axis."""
     consistency = get_statistics_by_filter(result)[name]
-    label = result.axis.label.removeprefix("the ")
+    label = result.axis.label.removeprefix("the axis of ")
     if isinstance(consistency, Unavailable):
         return [label, name, "", "", ("not evaluated", MUTED_COLOUR)]
     is_consistent = consistency.verdict == "consistent"

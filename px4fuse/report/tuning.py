@@ -100,7 +100,7 @@ def list_tuning_advice(
             "GNSS",
             KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(sensor="GNSS")
             if isinstance(comparison.flight.truth, Unavailable)
-            else "The estimates do not contain the time-correlated error of GNSS. Compare them "
+            else "The noise estimates do not contain the time-correlated error of GNSS. Compare them "
             "with ground truth: px4fuse compare LOG.",
         )
     elif options:

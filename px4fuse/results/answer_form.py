@@ -105,9 +105,9 @@ CHOICE_LETTERS: tuple[ChoiceLetter, ...] = get_args(ChoiceLetter)[1:]
 MAX_CHOICES = 20
 FIGURE_QUESTIONS_COMMENT = """
 # Figures: the picture of the same name (.png) shows other flights with other faults, analysed with
-# SIGMA_A 0.5 and SIGMA_Z 0.1. The background is grey while the vehicle flies in the direction of
-# the aisle, and white otherwise. Give the letter of the right answer. A wrong letter subtracts a
-# quarter of the points that a right letter gives.
+# SIGMA_A 0.5 and SIGMA_Z 0.1. The background is grey while the vehicle flies in one direction
+# of the straight path, and white otherwise. Give the letter of the right answer. A wrong letter
+# subtracts a quarter of the points that a right letter gives.
 [choices]
 """
 
@@ -209,7 +209,7 @@ _QUESTION_KIND_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
 
 
 class FormQuestion(Record):
-    """Numeric question about KF along the main axis.
+    """Numeric question about KF along the axis of largest motion.
 
     Attributes
     ----------

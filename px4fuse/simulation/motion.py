@@ -28,7 +28,7 @@ CLIMB_RAMP_DURATION_S = 1.5
 MAX_FLIGHT_S = 3600.0
 # Time (s) in which the path deviation grows after take-off, and shrinks before landing
 PATH_DEVIATION_RAMP_DURATION_S = 3.0
-# Time (s) of a 180° turn at the end of the aisle with --yaw follow
+# Time (s) of a 180° turn at the end of the straight path with --yaw follow
 TURN_ROUND_DURATION_S = 4.0
 # Minimum distance (s) of the breakpoints of piecewise polynomials
 MIN_POLYNOMIAL_BREAKPOINT_DISTANCE_S = 1e-9

@@ -15,7 +15,7 @@ SCENARIO_KINDS: tuple[ScenarioKind, ...] = get_args(ScenarioKind)
 
 # DT of KF (s): interval for which the acceleration noise SIGMA_A is defined
 DT_S = 0.1
-# Duration (s) of acceleration and braking along the aisle
+# Duration (s) of acceleration and braking on the straight path
 SPEED_RAMP_DURATION_S = 1.5
 CORNER_DURATION_S = 2.0
 # Default values that depend on the kind of flight
@@ -82,7 +82,7 @@ class Scenario:
     yaw : {"fixed", "follow"} or None
         Constant heading, or nose in the direction of flight.
     pause_s : float
-        Time of hover at each end of the aisle.
+        Time of hover at each end of the straight path.
     wander_m : float
         RMS of the slow deviation from the planned path, on each axis.
     vio_walk_m : float
@@ -99,14 +99,14 @@ class Scenario:
     kind: ScenarioKind = "aisle"
     passes: int = make_bounded_field(6, 1, 100)
     length_m: float = make_bounded_field(
-        12.0, 2.0, 1000.0, "Length of the aisle, or of each side of the square."
+        12.0, 2.0, 1000.0, "Length of the straight path, or of each side of the square."
     )
     speed_m_s: float = make_bounded_field(1.0, 0.1, 10.0, "Speed on straight segments.")
     heading_deg: float = make_bounded_field(
         30.0,
         -360.0,
         360.0,
-        "Heading of the aisle, or of the first side of the loop, clockwise from north.",
+        "Heading of the straight path, or of the first side of the square, clockwise from north.",
     )
     altitude_m: float = 1.5
     yaw: YawMode | None = None

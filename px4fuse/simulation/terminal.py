@@ -9,7 +9,7 @@ from px4fuse.simulation.faults import FAULT_TYPES, format_fault, injected_fault_
 from px4fuse.simulation.flights import Simulation
 
 PATH_AND_SOURCE_BY_KIND = {
-    "aisle": ("aisle", "UWB"),
+    "aisle": ("straight path", "UWB"),
     "loop": ("square", "VIO"),
     "outdoor": ("square", "GNSS"),
 }

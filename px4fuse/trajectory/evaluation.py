@@ -369,7 +369,8 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     if estimate.kind == "truth" and (has_same_frame or reference.kind == "truth"):
         return (
             "none",
-            "No alignment: the estimate is ground truth in the frame of the reference.",
+            "No alignment: the file of the estimate contains ground truth in the frame of the "
+            "reference.",
         )
     frames_text = f"{estimate.frame} and {reference.frame}"
     yaw_text = "Yaw and translation are aligned (4 degrees of freedom): "

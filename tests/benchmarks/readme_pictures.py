@@ -62,7 +62,7 @@ class Picture:
 PICTURES = (
     Picture("aisle_uwb", AISLE, "aisle_uwb.ulg"),
     Picture("explore", "explore sample_logs/aisle_uwb.ulg"),
-    Picture("lab_1", AISLE, "Position and velocity along the main axis"),
+    Picture("lab_1", AISLE, "Position and velocity along the axis of largest motion"),
     Picture("lab_2", SMALL_Q, "Innovations and variances along"),
     Picture("lab_3", AISLE, "Difference between KF and EKF2, setting"),
     Picture("lab_4", "loop sample_logs/loop_vio.ulg", "Loop closure", "Loop closures and RPE"),

@@ -138,7 +138,7 @@ def texts_of(outputs: Outputs) -> Iterator[tuple[str, str]]:
 
 
 def main_axis(outputs: Outputs) -> str:
-    """Return the main axis as texts name it: "the main axis", "north" or "east"."""
+    """Return the axis of largest motion as texts name it: "the axis of largest motion", "north" or "east"."""
     effect = outputs["json"]["card"].get("effect") or {}
     return str(effect.get("axis", "")).partition(",")[0].removeprefix("along ")
 
@@ -178,7 +178,7 @@ def json_noises(outputs: Outputs) -> Iterator[Statement]:
 def json_axes(outputs: Outputs) -> Iterator[Statement]:
     """Yield σ ratio, verdict and RMSE of each filter and axis, and the rejected share."""
     for name, axis in outputs["json"]["axes"].items():
-        label = "the main axis" if name == "aisle" else name
+        label = "the axis of largest motion" if name == "aisle" else name
         for filter_name, summary in axis["filters"].items():
             if summary.get("sigma_ratio") is None:
                 continue
@@ -215,7 +215,7 @@ def json_trials(outputs: Outputs) -> Iterator[Statement]:
         when = "" if trial.get("from_s") is None else ", time of replay"
         # of an axis on which the replay differs from the log, the numbers are from the replay
         basis = "" if trial.get("is_logged", True) else ", replay"
-        axis = "the main axis" if trial["axis"] == "aisle" else trial["axis"]
+        axis = "the axis of largest motion" if trial["axis"] == "aisle" else trial["axis"]
         fact = f"{trial['filter']} {axis}{when}"
         for name, field, power in (
             (f"σ ratio {fact}", "nis_mean", 0.5), (f"truth ratio {fact}", "nees_mean", 0.5),
@@ -294,7 +294,7 @@ def named(fact: str, factor: float = 1.0) -> Reading:
 
 NAMED_NUMBER = NUMBER.replace("(", "(?P<number>", 1)
 NAME = r"(?P<name>(?:EKF2|SENS)_[A-Z0-9_]+)"
-AXIS = r"(?P<axis>the main axis|north|east|down)"
+AXIS = r"(?P<axis>the axis of largest motion|north|east|down)"
 INTERVAL = rf"\(95 % {NUMBER} to {NUMBER}"
 READINGS: tuple[tuple[str, Reading], ...] = (
     (rf"IMU and positions is {NUMBER} s {INTERVAL} s\)", offset_estimate),

@@ -195,7 +195,7 @@ def _exists_with_same_content(path: Path, content: bytes) -> bool:
         return True
     raise OutputError(
         f"{path} exists with other content and was not overwritten. Give the secret and the "
-        "options of the earlier command, or choose another folder (-o)."
+        "options of the command that wrote the file, or choose another folder (-o)."
     )
 
 
@@ -203,6 +203,6 @@ def _require_answer_key_of_same_flights(key_file: Path, has_same_flights: bool) 
     if not has_same_flights:
         raise OutputError(
             f"{key_file} is the answer key of other flights and was not overwritten. Choose "
-            "another file with --answer. To add students, repeat the secret, options and students "
-            "of this key."
+            "another file with --answer. To add students to the key, repeat its secret, options "
+            "and students."
         )

@@ -18,15 +18,15 @@ from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import make_scenario
 
 FIGURE_COUNT = 3
-# Number of straight passes along the aisle in each simulated flight
+# Number of straight passes along the path in each simulated flight
 STRAIGHT_PASS_COUNT = 4
-# Minimum velocity (m/s) in the positive aisle direction for a grey background of the plot
+# Minimum velocity (m/s) in the positive direction of the path for a grey background of the plot
 MIN_SPEED_FOR_GREY_BACKGROUND_M_S = 0.2
 # Questions about each figure; the keys are fields of FigureAnswers
 QUESTIONS = {
     "fault": "injected fault of the flight",
     "evidence": "plots that show the fault, and plots that do not show the fault",
-    "change": "smallest change after which both KF and EKF2 are consistent",
+    "change": "smallest change of data or settings after which both KF and EKF2 are consistent",
     "prediction": "effect on KF and EKF2 if SIGMA_Z and EKF2_EVP_NOISE are multiplied by 3",
     "useless": "change of data or settings that does not correct the fault, and the reason",
 }
@@ -134,7 +134,7 @@ def _plot_figures(comparisons: Mapping[str, Comparison]) -> bytes:
         for (title, comparison), axes in zip(comparisons.items(), rows, strict=True):
             innovation_axes, *error_axes, map_axes = axes
             result = comparison.main.with_whole_flight_tracks()
-            innovation_axes.set_title(f"{title}: innovations along the aisle and ±2√S (m)")
+            innovation_axes.set_title(f"{title}: innovations along the path and ±2√S (m)")
             panels.draw_innovations(innovation_axes, result)
             for axis, filter_name in zip(error_axes, FILTER_NAMES, strict=True):
                 _draw_errors(axis, result, filter_name)
@@ -149,7 +149,7 @@ def _draw_errors(axes: style.Axes, result: AxisComparison, filter_name: FilterNa
     """Plot the position error of a filter and ±2σ."""
     name, truth = FILTER_NAMES[filter_name], result.truth
     errors = compute_position_errors(result, filter_name)
-    axes.set_title(f"{name}: error along the aisle and ±2σ (m)")
+    axes.set_title(f"{name}: error along the path and ±2σ (m)")
     assert isinstance(errors, pd.DataFrame)
     assert isinstance(truth, pd.DataFrame)
     colour = style.SIGMA_BAND_COLOURS[name]

@@ -208,7 +208,7 @@ def read_answer_key(path: Path) -> AnswerKey:
     except (msgspec.MsgspecError, RecursionError, ValueError) as error:
         raise SettingsError(
             f"{path} is not an answer key, or is from another px4fuse version ({error}).",
-            "Give the file that px4fuse simulate --assignment wrote.",
+            "Give the answer key that px4fuse simulate --assignment wrote.",
         ) from error
     return key
 

@@ -337,7 +337,7 @@ def _choose_counted_report(candidates: Sequence[_Candidate], course: Course) -> 
         if other.time_s >= chosen.time_s and (other.report.instructor_action or not is_report):
             status = "pending" if is_report else "not a report"
             name = one_line(other.report.submission, 80)
-            flags.append(f"The file {name} does not count: it is {status}.")
+            flags.append(f"The file {name} does not count for the grade: it is {status}.")
     return replace(
         chosen.grade,
         counted_report=report,
@@ -431,7 +431,7 @@ def read_overrides(path: Path) -> OverridesByStudent:
         elif points and (parsed_points is None or parsed_points < 0.0):
             problem = f"the points must be a number of 0 or more, not {one_line(points, 20)!r}"
         elif points and not item_title:
-            problem = "the points have no item: write a rubric title or 'total' as item"
+            problem = "the row has points but no item: write a rubric title or 'total' as item"
         if problem:
             raise SettingsError(f"{path}: row {row_number}: {problem}.")
         overrides[student][item_title] = GradeOverride(

@@ -51,7 +51,7 @@ CLASS_TABLE_NUMBERS = (
     ("mean NIS of KF, north", "axes.north.filters.kf.nis_mean"),
     ("mean NIS of KF, east", "axes.east.filters.kf.nis_mean"),
     (
-        "position RMSE of KF against ground truth, along the main axis (m)",
+        "position RMSE of KF against ground truth, along the axis of largest motion (m)",
         "axes.aisle.filters.kf.truth.position_rmse_m",
     ),
     ("closure error (m)", "loop.closure_error_m"),
@@ -238,7 +238,7 @@ def _find_problems(
     if scoring_input.has_form_of_other_log:
         yield "pending", FORM_MISMATCH_REASON, FORM_MISMATCH_ADVICE
     if scoring_input.key is not None and getattr(scoring_input.results.request, "position", None):
-        action = "Ask for the origin of the position file: students are given a log only."
+        action = "Ask the student for the source of the position file: students are given a log only."
         yield "pending", "", action
 
 

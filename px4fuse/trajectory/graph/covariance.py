@@ -63,7 +63,7 @@ def gate_edges(graph: model.PoseGraph, tested_edge_indices: IntArray) -> list[Ga
         raise TrajectoryError(
             f"The closures cannot be tested: no odometry edge connects vertices "
             f"{graph.ids[pose_index]} and {graph.ids[pose_index + 1]}",
-            "Add this edge.",
+            "Add an odometry edge between these vertices.",
         )
     poses = lie.accumulate_poses(model.get_odometry_steps(graph, connecting_edges))
     # Covariances of successive odometry steps can be added after conversion to the axes of the

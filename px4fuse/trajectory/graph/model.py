@@ -142,7 +142,7 @@ def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> 
         raise TrajectoryError(
             f"The pose graph has {component_count} disconnected parts: vertex "
             f"{other_vertex} is not connected to vertex {graph.ids[0]} by {edges_name}.",
-            "Connect the parts, or optimise each part separately.",
+            "Connect the parts of the graph, or optimise each part separately.",
         )
 
 
