@@ -55,7 +55,7 @@ class Analysis(Comparison, Estimates, Reruns):
         return model if isinstance(model, Unavailable) else model.baseline_replay
 
     def select_main_reruns(self) -> list[Rerun]:
-        """Return the re-runs along the axis of ``main`` that are compared with the original results."""
+        """Return the re-runs along the axis of ``main`` to compare with the original results."""
         main_axis = self.main.axis.name
         return [rerun for rerun in self.reruns if rerun.axis == main_axis and rerun.is_logged]
 

@@ -51,7 +51,9 @@ def report(tmp_path_factory, sample_log) -> tuple[Path, str]:
 def test_results_attached_to_report_pdf_contain_no_file_paths(report):
     folder, said = report
     assert sorted(p.name for p in folder.iterdir()) == ["notes.md", "report.json", "report.pdf"]
-    assert "warning[kf_underconfident]: KF is underconfident along the axis of largest motion" in said
+    assert (
+        "warning[kf_underconfident]: KF is underconfident along the axis of largest motion" in said
+    )
     assert f"Wrote    {folder / 'report.pdf'}" in said
     assert len(said.splitlines()) <= 42, "the summary must stay short"
     text = (folder / "report.json").read_bytes()

@@ -359,7 +359,10 @@ def test_height_reset_is_kept_if_source_has_no_height():
     assert "removed" in remove_origin_resets(ekf2, track, WHOLE)[1]
     state, statement = remove_origin_resets(ekf2, blind, WHOLE)
     pd.testing.assert_frame_equal(state, ekf2.state)
-    assert statement == "Jumps by EKF2 resets (1 of height) are kept: the resets correct an error of EKF2"
+    assert (
+        statement
+        == "Jumps by EKF2 resets (1 of height) are kept: the resets correct an error of EKF2"
+    )
 
 
 @pytest.mark.parametrize(("reset_s", "said"), [

@@ -264,7 +264,7 @@ def _summarise_errors(analysis: Analysis) -> FlightErrors:
 
 
 def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
-    """Describe the direction of an axis, for example "along the axis of largest motion, 30° from north"."""
+    """Describe a direction, for example "along the axis of largest motion, 30° from north"."""
     direction, heading, source = f"along {result.axis.label}", result.heading_deg, analysis.source
     if result.axis.name != AISLE or heading is None:
         return direction
@@ -504,8 +504,8 @@ def _explain_differing_verdicts(
         filter_labels = " and ".join(FILTER_NAMES[name] for name in filters_with_differing_ratios)
         return (
             f"The first fault on this card hardly changes the innovations of {filter_labels}, but "
-            "it increases the errors against ground truth. A re-run without the first fault reduces "
-            "the position error."
+            "it increases the errors against ground truth. A re-run without the first fault "
+            "reduces the position error."
         )
     if analysis.source.origin.may_drift:
         return (

@@ -50,7 +50,9 @@ def parse_landing(text: str) -> Landing:
 def parse_closure(text: str) -> GivenClosure:
     """Parse a loop closure: ``T1,T2`` (s) or ``T1,T2,SIGMA`` (m)."""
     return GivenClosure(
-        *_parse_numbers(text, "T1,T2 (times at one place, s) or T1,T2,SIGMA (σ in m)", sys.float_info.max)
+        *_parse_numbers(
+            text, "T1,T2 (times at one place, s) or T1,T2,SIGMA (σ in m)", sys.float_info.max
+        )
     )
 
 

@@ -142,8 +142,8 @@ class CommandWithFaultTable(click.Command):
     "--passes",
     type=int,
     metavar="N",
-    help="Number of passes of the straight path, or laps of the square.  [default: 6 passes, 1 lap; "
-    "outdoors 3 laps]",
+    help="Number of passes of the straight path, or laps of the square.  [default: 6 passes, 1 "
+    "lap; outdoors 3 laps]",
 )
 @click.option(
     "--yaw",

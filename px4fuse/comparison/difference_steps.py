@@ -200,14 +200,12 @@ def _describe_replacement_effect(
     replacement: PropertyReplacement, explanation: DifferenceExplanation
 ) -> str:
     explained_fraction = replacement.position_mean_square_m2 / explanation.position_mean_square_m2
-    increase_text = ""
-    if explained_fraction > 1.0:
-        increase_text = " Other replaced properties increase the difference."
+    increase_text = " Other replaced properties increase the difference."
     return (
         f"If KF uses EKF2's {replacement.name}, KF's position changes by up to "
         f"{replacement.position_moved_m:.2f} m (at {replacement.moved_at_s:.1f} s), and the mean "
         f"square difference KF - EKF2 decreases by {100 * explained_fraction:.0f} % "
-        f"of its original value.{increase_text}"
+        f"of its original value.{increase_text * (explained_fraction > 1.0)}"
     )
 
 

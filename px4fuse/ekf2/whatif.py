@@ -581,8 +581,8 @@ def _describe_deviation(
         note += f". The heights of both replays differ by at most {height_difference_m.max():.3g} m"
     if horizontal_aids <= disable_time_s_by_aid.keys():
         note += (
-            ". The replay without aiding sources uses only the IMU. EKF2 stops publishing a position after "
-            "EKF2_NOAID_TOUT (5 s)"
+            ". The replay without aiding sources uses only the IMU. EKF2 stops publishing "
+            "a position after EKF2_NOAID_TOUT (5 s)"
         )
     return note
 

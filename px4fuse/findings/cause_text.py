@@ -61,7 +61,7 @@ def classify_cause(analysis: Analysis, cause: Rerun | None) -> str:
 
 
 def rerun_refutes_cause(analysis: Analysis, filter_name: FilterName, cause: Rerun) -> bool:
-    """Return True if a change improves neither σ nor RMSE in a re-run along the axis of largest motion."""
+    """Return True if a change improves neither σ nor RMSE along the axis of largest motion."""
     return any(
         (rerun.filter, rerun.change) == (filter_name, cause.change)
         and can_show_improvement(rerun)

@@ -165,8 +165,8 @@ def _detect_gyro_bias(bias_states: pd.DataFrame, median_imu_at_rest: pd.Series |
     yield make_error(
         "gyroscope_bias",
         f"The gyroscope measures {measured:+.2f} rad/s about {direction} at rest. EKF2 estimates "
-        f"only {estimated:+.3f} rad/s of this bias in flight (median), so EKF2's attitude drifts by "
-        f"{math.degrees(abs(measured - estimated)):.0f}°/s.",
+        f"only {estimated:+.3f} rad/s of this bias in flight (median), so EKF2's attitude drifts "
+        f"by {math.degrees(abs(measured - estimated)):.0f}°/s.",
         "Calibrate the gyroscopes while the vehicle is at rest.",
         {"measured_rad_s": measured, "estimated_rad_s": estimated},
     )

@@ -69,7 +69,8 @@ MAX_RATIO_OF_EQUAL_NOISES = 1.25
 # ratio
 MIN_USED_TO_PARAMETER_NOISE_RATIO = 1.25
 UNEXPLAINED_SIGMA_ACTION = (
-    "No tested change of data or settings makes the filter's σ consistent. Check the IMU (rate, gaps, vibration)."
+    "No tested change of data or settings makes the filter's σ consistent. Check the IMU (rate, "
+    "gaps, vibration)."
 )
 UNKNOWN_NOISE_ACTION = "The noise could not be estimated; px4fuse tune LOG states the reason."
 NO_IMPROVEMENT_ACTION = (

@@ -268,8 +268,8 @@ def _detect_orientation_faults(
         )
         return
     agreement_text = (
-        "With the corrected orientation, roll and pitch agree with the autopilot (median difference "
-        f"{orientation.tilt_difference_deg:.1f}°)"
+        "With the corrected orientation, roll and pitch agree with the autopilot (median "
+        f"difference {orientation.tilt_difference_deg:.1f}°)"
     )
     fault_text, action = {
         "order": (

@@ -93,7 +93,9 @@ def compute_odometry_variances(
             "variance"
         )
     elif path.position_variance_m2 is not None:
-        variance_texts.append("the logged position variances are not used, because they do not increase")
+        variance_texts.append(
+            "the logged position variances are not used, because they do not increase"
+        )
     rotation_variance_increments_rad2 = _compute_variance_increments(
         path.rotation_variance_rad2, node_indices
     )

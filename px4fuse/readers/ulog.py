@@ -172,7 +172,7 @@ def _read_airborne_spans(topics: Topics) -> Spans | Unavailable:
         return Unavailable(
             "land detector",
             "vehicle_land_detected is not logged or not usable",
-            f"{DEFAULT_PROFILE_REMEDY} Alternatively, give start and end of the flight (--start, --end).",
+            f"{DEFAULT_PROFILE_REMEDY} Or give the start and end of the flight (--start, --end).",
         )
     topics.record_stream("airborne", "vehicle_land_detected")
     return common.find_flight_spans(land_detected["landed"], topics.log.duration_s)

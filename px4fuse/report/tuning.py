@@ -100,8 +100,8 @@ def list_tuning_advice(
             "GNSS",
             KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(sensor="GNSS")
             if isinstance(comparison.flight.truth, Unavailable)
-            else "The noise estimates do not contain the time-correlated error of GNSS. Compare them "
-            "with ground truth: px4fuse compare LOG.",
+            else "The noise estimates do not contain the time-correlated error of GNSS. Compare "
+            "them with ground truth: px4fuse compare LOG.",
         )
     elif options:
         command = f"px4fuse compare LOG {' '.join(options)}"

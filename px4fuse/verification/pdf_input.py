@@ -90,7 +90,8 @@ def read_report(pdf: bytes, name: str) -> ReportedResults:
     results = read_attached_results(pdf, name)
     if not isinstance(results, ReportedResults):
         raise ResultsError(
-            f"{one_line(name, 200)}: the attached {RESULTS_NAME} has no results of KF or of a loop closure."
+            f"{one_line(name, 200)}: the attached {RESULTS_NAME} has no results of KF or of "
+            "a loop closure."
         )
     return results
 

@@ -138,7 +138,7 @@ def texts_of(outputs: Outputs) -> Iterator[tuple[str, str]]:
 
 
 def main_axis(outputs: Outputs) -> str:
-    """Return the axis of largest motion as texts name it: "the axis of largest motion", "north" or "east"."""
+    """Return the name of the main axis in texts, for example "the axis of largest motion"."""
     effect = outputs["json"]["card"].get("effect") or {}
     return str(effect.get("axis", "")).partition(",")[0].removeprefix("along ")
 

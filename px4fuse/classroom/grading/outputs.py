@@ -475,8 +475,8 @@ def fill_grades(
         if max_points is not None and total_points > max_points:
             notes.append(
                 f"{sheet.path.name}: {names[student_index]} has {total_points:.10g} points, above "
-                f"the maximum of {max_points:.10g} in the table. Increase the maximum on the learning "
-                f"platform, or run grade again with --scale {max_points:.10g}."
+                f"the maximum of {max_points:.10g} in the table. Increase the maximum on the "
+                f"learning platform, or run grade again with --scale {max_points:.10g}."
             )
         row[grade_column_index] = format_cell_number(total_points).replace(
             ".", "," if has_decimal_comma else "."

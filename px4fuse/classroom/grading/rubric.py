@@ -238,7 +238,9 @@ def _find_problems(
     if scoring_input.has_form_of_other_log:
         yield "pending", FORM_MISMATCH_REASON, FORM_MISMATCH_ADVICE
     if scoring_input.key is not None and getattr(scoring_input.results.request, "position", None):
-        action = "Ask the student for the source of the position file: students are given a log only."
+        action = (
+            "Ask the student for the source of the position file: students are given a log only."
+        )
         yield "pending", "", action
 
 
