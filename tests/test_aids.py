@@ -307,7 +307,7 @@ def test_compare_of_log_without_position_evaluates_other_sensors(tmp_path: Path)
     found = read_results(report.with_suffix(".json").read_bytes())
     assert found.log.sha256 in PdfReader(report).pages[-1].extract_text().replace("\n", "")
     refused = run("verify", report, log).exception
-    assert "has no results of KF or a loop" in str(refused)
+    assert "has no results of KF or of a loop" in str(refused)
 
 
 def test_compare_of_log_without_take_off_raises_an_error(tmp_path: Path) -> None:

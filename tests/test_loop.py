@@ -370,7 +370,7 @@ def test_odometry_edge_variance_is_increase_of_logged_variance() -> None:
     default, _, _ = compute_odometry_variances(odometry, nodes, OdometryNoise())
     same, _, words = compute_odometry_variances(constant, nodes, OdometryNoise())
     np.testing.assert_array_equal(same, default)
-    assert "do not grow" in words
+    assert "do not increase" in words
     growing = np.linspace(0.001, 0.4, len(odometry))[:, None].repeat(3, axis=1)
     with_growing = replace(odometry, position_variance_m2=growing)
     grown, _, words = compute_odometry_variances(with_growing, nodes, OdometryNoise())
