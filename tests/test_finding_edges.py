@@ -329,7 +329,7 @@ def test_report_on_error_above_reported_sigma_prefers_main_axis() -> None:
         "EKF2 error 5.0 times the reported σ"
     )
     assert finding.evidence["filter"] == "ekf2"
-    # the main axis is preferred
+    # the axis of largest motion is preferred
     main = only(hidden_errors.detect, analysis(axes=(hiding(), ekf2)))
     assert main.evidence["filter"] == "kf"
     assert finding.evidence["ekf2_sigma_p_m"] == pytest.approx(0.2)

@@ -166,7 +166,7 @@ def rerun_filters(
 
 
 def rerun_kf_with_time_offset(prepared: PreparedComparison, time_offset: SourceTimeOffset) -> Rerun:
-    """Run KF along the main axis with and without a time offset, as :func:`rerun_filters` does."""
+    """Run KF along one axis with and without a time offset, as :func:`rerun_filters` does."""
     comparison = compare(prepared)
     change = {TIME_OFFSET_KEY: round(time_offset.offset_s, 3)}
     return Rerun(
