@@ -257,9 +257,9 @@ def find_detector_modules() -> dict[str, str]:
 
 
 def is_numeric_literal(expression: ast.expr) -> bool:
-    """Return True for a number or a tuple of literals, False for text and for named constants."""
+    """Return True for a number or a tuple of numbers, False for text and for named constants."""
     try:
-        return not isinstance(ast.literal_eval(expression), str)
+        return bool(np.issubdtype(np.asarray(ast.literal_eval(expression)).dtype, np.number))
     except ValueError:
         return False
 

@@ -41,10 +41,12 @@ from px4fuse.flight.model import Ekf2, Unavailable
 
 # Severity "error" if EKF2's noise parameter is at least this factor too small or too large
 MIN_NOISE_FACTOR_FOR_ERROR = 2.0
+# Minimum fraction of rejected positions that the finding on a too small noise of EKF2 states
 MIN_REJECTED_FRACTION_IN_MESSAGE = 0.05
 # Minimum fraction of rejected positions for a warning: with a gate of 5 √S, a consistent filter
 # rejects a fraction of 6e-7
 REJECTED_FRACTION_FOR_WARNING = 0.01
+# Minimum fraction of rejected positions for severity "error"
 REJECTED_FRACTION_FOR_ERROR = 0.20
 # A re-run with a changed setting prevents rejections if it reduces the rejected fraction to less
 # than this multiple of the fraction without the change

@@ -47,6 +47,7 @@ BIAS_LIMIT_PARAMETERS = (
 MIN_BIAS_TO_LIMIT_RATIO = 0.98
 # Minimum fraction of the flight with a bias at its limit, for a finding
 MIN_TIME_AT_LIMIT_FRACTION = 0.5
+# Length (s) of the windows in which px4fuse tests if the vehicle is at rest before take-off
 REST_WINDOW_S = 1.0
 # Time (s) before take-off in which the motors run
 MOTOR_RUN_UP_DURATION_S = 0.5
@@ -56,9 +57,10 @@ MAX_RATE_STD_AT_REST, MAX_FORCE_STD_AT_REST = 0.04, 1.5
 MAX_RATE_CHANGE_AT_REST_RAD_S = 0.01
 # Minimum gyroscope bias (rad/s) for a finding: the heading turns by 90° in 30 s
 MIN_GYRO_BIAS_RAD_S = 0.05
-# Minimum |specific force at rest - gravity| (m/s²) for the finding to mention this difference
+# Minimum |specific force at rest - gravity| (m/s²): above it, the finding on a bias at its limit
+# states the specific force at rest
 MIN_GRAVITY_ERROR_M_S2 = 0.3
-# Maximum fraction of the flight without tilt or yaw alignment
+# Maximum fraction of the flight without tilt or yaw alignment that gives no finding
 MAX_UNALIGNED_FRACTION = 0.02
 # Maximum time (s) from tilt alignment to heading alignment without a finding
 MAX_HEADING_ALIGNMENT_DELAY_S = 5.0

@@ -21,6 +21,7 @@ from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, sample_rate
 
 # Maximum specific force (m/s²) of real sensors: 35 g, because the largest range is 32 g
 MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2 = 343.0
+# Minimum number of samples above this maximum specific force of real sensors, for a finding
 MIN_IMPLAUSIBLE_FORCE_SAMPLES = 3
 # Minimum accelerometer bias (m/s²) for severity "error"; it causes an error of 0.15 m in 1 s
 MIN_SEVERE_BIAS_M_S2 = 0.3
@@ -34,6 +35,7 @@ MIN_IMU_RATE_HZ = 50.0
 MIN_ATTITUDE_RATE_HZ = 10.0
 # Maximum normal duration (s) of clipping: a touch-down clips one or two samples
 MAX_CLIPPING_DURATION_S = 0.1
+# Minimum time (s) between clipped samples that the finding states as separate times
 MIN_TIME_BETWEEN_CLIPPINGS_S = 2.0
 # Mask of SDLOG_PROFILE, bit 4: full IMU rate (logged_topics.cpp)
 SDLOG_HIGH_RATE_MASK = 16

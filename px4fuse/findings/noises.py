@@ -52,6 +52,7 @@ from px4fuse.request import COMPARISON_OPTIONS
 
 # Warning if a noise setting is at least this factor too small or too large
 MIN_SETTING_TO_ESTIMATE_FACTOR = 1.5
+# Severity "error" if a noise setting is at least this factor too small or too large
 MIN_NOISE_FACTOR_FOR_ERROR = 4.0
 # KF hardly reacts to new positions if its time constant exceeds this value (s)
 MIN_KF_TIME_CONSTANT_S = 2.5
@@ -62,8 +63,10 @@ INTERVAL_WIDENING_FACTOR = 1.5
 # 0.2)
 MIN_LAG1_AUTOCORRELATION = 0.3
 
+# Severity "error" if the reported σ is at least this factor too small or too large
 MIN_SIGMA_FACTOR_FOR_ERROR = 2.0
-# Maximum ratio of two σ that count as equal: a median of 100 values has a standard error of 12 %
+# Maximum ratio (larger ÷ smaller) of two noises that count as equal: a σ estimated from the median
+# of 100 values has a standard error of 12 %
 MAX_RATIO_OF_EQUAL_NOISES = 1.25
 # EKF2 is assumed to use the variance in the messages if EKF2's √R ÷ EKF2_EVP_NOISE exceeds this
 # ratio

@@ -57,7 +57,9 @@ MIN_CORRELATED_NOISE_LOG_LIKELIHOOD_RATIO_NATS = 5.0
 MIN_CORRELATED_NOISE_SIGMA_M = 0.005
 # Minimum fraction of repeated positions for a warning
 MIN_REPEATED_FRACTION = 0.05
+# Minimum fraction of repeated positions for severity "error"
 MIN_REPEATED_FRACTION_FOR_ERROR = 0.3
+# Minimum number of repeated positions for a finding
 MIN_REPEATED_POSITION_COUNT = 10
 # Minimum ratio for a warning: larger ÷ smaller position noise (σ) of two horizontal axes
 MIN_AXIS_NOISE_RATIO = 1.5
@@ -65,6 +67,7 @@ MIN_AXIS_NOISE_RATIO = 1.5
 MIN_NOISY_PART_SIGMA_RATIO = 2.0
 # Minimum ratio of the noise in one flight part to the noise in the rest, after removal of outliers
 MIN_NOISY_PART_SIGMA_RATIO_WITHOUT_OUTLIERS = 1.5
+# Minimum ratio of the noise in one flight part to the noise in the rest, for severity "error"
 MIN_NOISY_PART_SIGMA_RATIO_FOR_ERROR = 4.0
 # Minimum scale factor error (ratio minus 1) against ground truth: 0.8 m in 10 m
 MIN_SCALE_ERROR_AGAINST_TRUTH = 0.08

@@ -32,15 +32,17 @@ MIN_LOST_POSITION_FRACTION = 0.02
 MIN_INTERVAL_COUNT = 50
 # Minimum fraction of missing positions to report downsampling: a radio link loses fewer
 MIN_MISSING_FRACTION_FOR_DOWNSAMPLING = 0.25
-# After downsampling, most intervals between positions have one of two lengths: n or n + 1 periods
-# of the source. Minimum fraction of intervals with these lengths
+# Downsampling gives intervals between positions of two lengths: n or n + 1 periods of the source.
+# Minimum fraction of intervals with these lengths, to report downsampling
 MIN_FRACTION_OF_TWO_MOST_FREQUENT_INTERVALS = 0.85
-# Minimum fraction of intervals with the rarer of the two lengths n and n + 1 source periods
+# Downsampling gives intervals of n or n + 1 source periods. Minimum fraction of intervals with the
+# rarer of the two lengths
 MIN_FRACTION_OF_RARER_INTERVAL_LENGTH = 0.1
-# Maximum RMS deviation of intervals from whole multiples of the source period, divided by the
-# source period. Intervals with jitter have 0.03, random intervals 0.29
+# Maximum RMS deviation of the intervals from multiples of a tested source period, as fraction of
+# the period, to report downsampling. Intervals with jitter have 0.03, random intervals 0.29
 MAX_ROUNDING_RMS_ERROR = 0.06
-# The tested source periods are the median interval ÷ n; maximum of n
+# px4fuse searches the period of a downsampled source among the median interval ÷ n, n = 1, 2, … to
+# this value
 MAX_SOURCE_PERIODS_PER_MEDIAN_INTERVAL = 4
 # Minimum duration (s) of a gap at the start or end of the flight: take-off and landing are detected
 # some seconds late

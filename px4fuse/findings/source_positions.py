@@ -58,8 +58,9 @@ MIN_MOTION_RANGE_TO_NOISE_RATIO = 1.25 * 3.29
 MIN_LOW_PASS_LOG_LIKELIHOOD_RATIO_NATS = 6.0
 # Minimum log likelihood ratio (nats) of the low-pass model to the model of time-correlated noise
 MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS = 1.0
-# The lag of a low-pass filter is estimated from the correlation of the noise. If this lag ÷ upper
-# 95 % limit of the delay relative to the IMU exceeds this ratio, the delay is used as the lag
+# If the lag estimated from the autocorrelation of the position errors exceeds this multiple of the
+# upper 95 % limit of the delay relative to the IMU, px4fuse uses the delay as the lag of the
+# low-pass filter
 MAX_ESTIMATED_LAG_TO_DELAY_RATIO = 4.0
 # Minimum filter lag (s) for a warning; it causes a position error of 5 cm at 1 m/s
 MIN_LAG_S = 0.05
@@ -73,11 +74,13 @@ MIN_JUMP_SIGMAS = 5.0
 MIN_JUMPS_WITH_RESET_COUNTER = 2
 # Minimum number of jumps without a change of reset_counter to report repeated jumps
 MIN_JUMPS_WITHOUT_RESET_COUNTER = 3
+# Minimum position jump (m) without a change of reset_counter
 MIN_JUMP_WITHOUT_RESET_COUNTER_M = 0.1
 # Minimum ratio: jump without a change of reset_counter ÷ median position change
 MIN_JUMP_TO_MEDIAN_CHANGE_RATIO = 8.0
 # A jump is compared with the median of this number of position changes
 JUMP_WINDOW_SAMPLES = 61
+# Minimum number of position changes to detect repeated jumps
 MIN_POSITIONS_FOR_JUMPS = 100
 # Minimum time (s) and number of positions that a jump lasts: outliers go back to the track earlier
 MIN_JUMP_DURATION_S, MIN_JUMP_DURATION_SAMPLES = 0.6, 9
@@ -90,6 +93,7 @@ MAX_JUMP_TO_MEDIAN_INTERVAL_RATIO = 1.5
 MIN_OPPOSITE_JUMP_FRACTION = 0.7
 # Maximum time (s) from a position jump to the reset of EKF2 that the jump causes
 MAX_JUMP_TO_RESET_TIME_S = 5.0
+# Maximum number of jumps whose times the finding states
 MAX_LISTED_JUMPS = 8
 # Maximum rounding difference (s) between the timestamps of a position and of its reset_counter
 RESET_TIME_TOLERANCE_S = 1e-4
@@ -109,11 +113,13 @@ MIN_SCALE_ERROR_TO_SIGMA_RATIO = 3.0
 MIN_OUTLIER_FRACTION = 0.005
 # Minimum fraction of outliers, for severity "error": one outlier in 10 s at 5 Hz
 MIN_OUTLIER_FRACTION_FOR_ERROR = 0.02
+# Minimum number of outliers for a finding
 MIN_OUTLIERS = 3
 # Minimum fraction of positions with logged innovations, to state the number of rejected outliers
 MIN_LOGGED_POSITION_FRACTION = 0.75
 # Warning if the reported position variance is at least this factor too small or too large
 MIN_VARIANCE_ERROR_FACTOR = 2.0
+# Severity "error" if the reported variance is at least this factor too small or too large
 MIN_VARIANCE_ERROR_FACTOR_FOR_SEVERITY_ERROR = 3.0
 
 

@@ -39,14 +39,17 @@ MIN_LATENCY_FOR_ERROR_S = 0.10
 MIN_LATENCY_CORRELATION = 0.8
 # Minimum fraction of positions that EKF2 drops because of their latency, for a finding
 MIN_DROPPED_POSITION_FRACTION = 0.02
+# Minimum number of positions before and after TIMESYNC converges, to detect the convergence
 MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC = 10
-# Minimum fraction of timestamps of the expected kind: arrival times until TIMESYNC converges,
-# measurement times afterwards
+# Minimum fraction of position timestamps that are arrival times (in the whole flight, or until
+# TIMESYNC converges), and of later timestamps that are measurement times, for a finding
 MIN_FRACTION_OF_EXPECTED_TIMESTAMP_KIND = 0.95
 # Minimum mean number of positions in a burst (positions that arrive together)
 MIN_BURST_POSITIONS = 2.5
-# Minimum number of pauses before bursts; fewer pauses count as gaps in the position source
+# Minimum number of intervals longer than the mean interval, to report that positions arrive in
+# bursts; fewer long intervals are gaps in the position source
 MIN_BURST_COUNT = 20
+# Maximum ratio for positions in bursts: duration of a burst ÷ pause before the next burst
 MAX_BURST_TO_PAUSE_DURATION_RATIO = 0.3
 ANSWER_TIMESYNC_ACTION = (
     "Let the companion computer answer TIMESYNC (MAVROS does by default; with pymavlink answer "

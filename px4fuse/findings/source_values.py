@@ -43,8 +43,10 @@ MIN_SENDER_DISTANCE_M = 0.1
 # Minimum distance between the positions of two senders ÷ scatter (1 σ) of this distance. With a
 # single sender, noise causes ratios of up to 2
 MIN_SENDER_DISTANCE_SIGMAS = 4.0
-# Window length (samples): short, because a lost sample swaps the senders of even and odd samples
+# Length (samples) of the windows in which even samples are compared with odd samples, to detect two
+# alternating senders: short, because a lost sample exchanges even and odd
 WINDOW_SAMPLES = 16
+# Minimum number of windows of WINDOW_SAMPLES samples in a flight, to detect two senders
 MIN_SAMPLE_WINDOWS_TO_DETECT_TWO_SENDERS = 10
 # Positions are copies of EKF2's estimate if the median distance (m) is below this limit
 MAX_DISTANCE_OF_COPY_M = 0.01
@@ -56,7 +58,8 @@ MAX_DISTANCE_OF_FUSED_COPY_M = 0.001
 MIN_SPEED_TO_DETECT_COPIED_ESTIMATE_M_S = 0.2
 # Tested delays (s) of positions that are copies of EKF2's position
 TESTED_DELAYS_OF_COPIED_ESTIMATE_S = np.arange(0.0, 0.305, 0.005)
-# Approximate number of positions that are used to find this delay of copied positions
+# Approximate number of positions with which px4fuse estimates the delay of positions that are
+# copies of EKF2's position
 POSITION_COUNT_TO_FIND_DELAY_OF_COPY = 300
 # Finding id, fault and action for each reason of an invalid position
 INVALID_POSITION_TEXTS: Mapping[str, tuple[str, str, str]] = {

@@ -138,44 +138,50 @@ def waterfalls(models: dict[str, Ekf2Model]) -> dict[str, float]:
 
 
 def agreement_page(models: dict[str, Ekf2Model], left: dict[str, float]) -> str:
-    """Return the table of agreement for the documentation, of some typical flights."""
+    """Return the table and notes on agreement for the documentation, of some typical flights."""
     lines = [
-        "| flight | innovations in the log | correlation of innovations | S replayed ÷ S logged | "
-        "rejected samples | position difference replay - log | difference KF - EKF2 | "
-        "source of the height |",
-        "|---|---|---|---|---|---|---|---|",
+        "| flight | replayed and logged innovations | S replayed ÷ S logged | rejected samples | "
+        "position difference replay - log |",
+        "|---|---|---|---|---|",
     ]
+    notes = []
     for name, model in models.items():
         if name not in DOCUMENTED_FLIGHTS:
             continue
         a, axes = model.agreement, model.agreement.axes.items()
         statistics = [statistic for _, statistic in axes]
         cells = (
-            name, f"{a.samples} innovations",
+            name,
             "correlation "
             + ", ".join(f"{x.innovation_correlation:.4f} {axis}" for axis, x in axes),
             f"S replayed ÷ S logged {min(x.s_ratio_p5 for x in statistics):.3f} to "
             f"{max(x.s_ratio_p95 for x in statistics):.3f}",
-            f"rejected in replay {100.0 * a.rejected_fraction_replayed:.1f} %, "
-            f"in flight {100.0 * a.rejected_fraction_logged:.1f} %",
+            f"rejected {100.0 * a.rejected_fraction_replayed:.1f} % in the replay, "
+            f"{100.0 * a.rejected_fraction_logged:.1f} % in flight",
             "position difference "
             + ", ".join(f"{x.position_rms_difference_m:.3f} m {axis}" for axis, x in axes),
-            f"{100.0 * left[name]:.1f} % of the difference KF - EKF2 unexplained", height_cell(a),
         )  # fmt: skip
         lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        notes += height_notes(name, a)
+    unexplained = max((left[name] for name in models if name in DOCUMENTED_FLIGHTS), default=np.nan)
+    notes.append(
+        "The section *Difference between KF and EKF2* of the reports on these flights leaves at "
+        f"most {100.0 * unexplained:.1f} % of the mean square position difference unexplained."
+    )
+    return "\n\n".join(["\n".join(lines), *notes])
 
 
-def height_cell(agreement: Agreement) -> str:
-    """Return the table cell of a flight with replayed heights."""
+def height_notes(name: str, agreement: Agreement) -> list[str]:
+    """Return the note on a flight with replayed heights, or no note."""
     heights = [*agreement.gnss_hgt.values(), *agreement.baro_hgt.values()]
     if not heights or agreement.doubtful:
-        return "height from the log"
+        return []
     gnss, barometer = (axis.innovation_correlation for axis in heights)
-    return (
-        f"height replayed: innovation correlation {gnss:.4f} (GNSS), {barometer:.4f} (barometer); "
-        f"height difference {heights[0].position_rms_difference_m:.3f} m RMS"
-    )
+    return [
+        f"Height replay of {name}: replayed and logged height innovations have the correlation "
+        f"{gnss:.4f} (GNSS) and {barometer:.4f} (barometer). The RMS height difference is "
+        f"{heights[0].position_rms_difference_m:.3f} m."
+    ]
 
 
 def in_page() -> str:
