@@ -89,10 +89,9 @@ def _write_page(page: Page, loop: Loop) -> None:
     page.add_legend(axes.get_legend_handles_labels()[0])
     page.write_heading("Loop closures and RPE")
     page.write_muted_text(
-        "d²: squared Mahalanobis distance of the closure error, given drift and closure noise. p: "
-        "probability that a true closure has a larger d²; the gate rejects a closure with p below "
-        f"{GATE_ALPHA:g}. Weight of GNC (graduated non-convexity): 1 for a used closure, 0 for an "
-        "excluded closure."
+        "p: probability that a true closure has a larger error, given drift and closure noise; "
+        f"the χ² test rejects p below {GATE_ALPHA:g}. Weight of GNC (graduated non-convexity): 1 "
+        "for a used closure, 0 for an excluded closure."
     )
     _write_closures(page, loop)
     _write_rpe(page, loop)
@@ -169,8 +168,7 @@ def _write_closures(page: Page, loop: Loop) -> None:
         verb = "accepted" if closure.accepted else "rejected"
         text = (
             f"{capitalise_first(f'{closure}'.removeprefix('the '))}: {verb} by the χ² test (error "
-            f"{closure.distance_m:.2f} m, d² {closure.d2:.1f} at {closure.degrees_of_freedom} "
-            f"degrees of freedom, {format_p_value(closure.p)})"
+            f"{closure.distance_m:.2f} m, {format_p_value(closure.p)})"
         )
         if closure.weight_gnc is not None:
             text += f"; GNC weight {closure.weight_gnc:.2f}"
