@@ -81,7 +81,7 @@ def test_loop_command_writes_report_results_tum_and_g2o(made, found) -> None:
     assert result.exit_code == 0, result.output
     names = ["r.g2o", "r.json", "r.pdf", "r.tum"]
     assert sorted(path.name for path in folder.iterdir()) == names
-    for said in ("REJECTED", *(f"Wrote    {folder / n}" for n in names)):
+    for said in ("rejected by the χ² test", *(f"Wrote    {folder / n}" for n in names)):
         assert said in result.output
     reader = pypdf.PdfReader(folder / "r.pdf")
     assert reader.attachments["results.json"] == [(folder / "r.json").read_bytes()]
@@ -198,7 +198,7 @@ def test_evaluate_command_writes_only_the_named_files(
     assert set(contents(tmp_path)) == written
     alone = "--json -" in options
     assert alone == result.output.startswith("{")
-    assert alone == ("ATE (m)" not in result.output)
+    assert alone == ("ATE: " not in result.output)
 
 
 def test_loop_with_reference_reports_ate_of_each_correction(desk) -> None:

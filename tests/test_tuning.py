@@ -264,13 +264,13 @@ def test_tune_estimates_random_walk_of_drifting_source() -> None:
     ("noise", "expected"),
     [
         (NoiseEstimate(None, None, None), "not identifiable"),
-        (NoiseEstimate(None, None, 0.25), "at most 0.25"),
-        (NoiseEstimate(None, 8.0, None), "at least 8"),
-        (NoiseEstimate(0.1, None, 0.2), "0.1 (0-0.2)"),
-        (NoiseEstimate(0.1, 0.05, None), "0.1 (0.05-?)"),
+        (NoiseEstimate(None, None, 0.25), "at most 0.25 m"),
+        (NoiseEstimate(None, 8.0, None), "at least 8 m"),
+        (NoiseEstimate(0.1, None, 0.2), "0.1 m (95 % 0 to 0.2)"),
+        (NoiseEstimate(0.1, 0.05, None), "0.1 m (95 % above 0.05)"),
     ],
 )
 def test_noise_estimate_is_printed_with_interval_or_bound(
     noise: NoiseEstimate, expected: str
 ) -> None:
-    assert format_noise_estimate(noise) == expected
+    assert format_noise_estimate(noise, "m") == expected

@@ -20,9 +20,8 @@ from px4fuse.flight.model import Flight
 from px4fuse.report.whatif import (
     NOT_PREDICTABLE_TEXT,
     describe_sweep,
-    make_column_headings,
-    make_statistic_rows,
-    make_sweep_table,
+    list_statistics,
+    list_sweep_results,
     make_whatif_page,
 )
 from px4fuse.request import Sweep, WhatIfRequest, command_line
@@ -96,14 +95,11 @@ def test_what_if_without_set_option_keeps_correct_parameters(estimated: WhatIfAn
     assert not estimated.statistics.whatif
     texts = [str(block) for block in make_whatif_page(estimated).blocks]
     assert any("fit this log best" in text for text in texts)
-    table, found = (
-        {label.strip(): cells for label, *cells in make_statistic_rows(estimated)},
-        estimated.statistics,
-    )
-    every = (found.logged, found.replayed)
-    assert table["north: mean NIS"] == [f"{s.axes['north'].nis_mean:.3g}" for s in every]
-    assert table["samples"] == [str(s.samples) for s in every]
-    assert all(len(cells) == len(make_column_headings(estimated)) == 2 for cells in table.values())
+    title, *lines = list_statistics(estimated)
+    assert title.endswith("EKF2 (replay) as flown:")
+    nis = f"{estimated.statistics.replayed.north.nis_mean:.3g}"
+    assert any(f"north: mean NIS {nis} (expected" in line for line in lines)
+    assert not any("→" in line for line in lines)
 
 
 def test_whatif_sweep_also_applies_parameters_of_set_option(swept: WhatIfAnalysis) -> None:
@@ -113,8 +109,8 @@ def test_whatif_sweep_also_applies_parameters_of_set_option(swept: WhatIfAnalysi
     assert all(value.changed["EKF2_EVP_GATE"] == 3.0 for value in values)
     nis = [value.nis_mean for value in values]
     assert nis == sorted(nis, reverse=True)
-    assert make_sweep_table(swept)[0][0] == "EKF2_EVP_NOISE (m)"
-    assert [row[0] for row in make_sweep_table(swept)[1]] == ["0.05", "0.1", "0.2"]
+    for text, line in zip(("0.05", "0.1", "0.2"), list_sweep_results(swept), strict=True):
+        assert line.startswith(f"EKF2_EVP_NOISE {text} m: horizontal position RMSE")
     best, error, *_ = describe_sweep(swept)
     assert "closest to 1 at EKF2_EVP_NOISE 0.1" in best
     least = min(values, key=lambda value: value.position_rmse_to_truth_m)
@@ -194,10 +190,10 @@ def test_what_if_table_omits_numbers_if_not_predictable(sample_flight: Flight) -
     request = WhatIfRequest(log=name, changes={"EKF2_EVP_NOISE": 0.02}, sweep=sweep)
     assert command_line(request).endswith("--set EKF2_EVP_NOISE=0.02 --sweep EKF2_EVP_GATE=1:5:2")
     told = run_what_if(request, flight=sample_flight)
-    table = make_statistic_rows(told)
-    assert {line[3] for line in table} == {NOT_PREDICTABLE_TEXT}
-    assert all(NOT_PREDICTABLE_TEXT not in line[:3] for line in table)
-    assert [line[1] for line in make_sweep_table(told)[1]] == [NOT_PREDICTABLE_TEXT] * 2
+    changed, *lines = list_statistics(told)
+    assert changed == f"EKF2 (replay), EKF2_EVP_NOISE 0.02 m: {NOT_PREDICTABLE_TEXT}"
+    assert not any(NOT_PREDICTABLE_TEXT in line for line in lines)
+    assert all(line.endswith(NOT_PREDICTABLE_TEXT) for line in list_sweep_results(told))
     said = " ".join(describe_sweep(told))
     assert "'not predictable': the replay rejects more than 35% of the samples" in said
     assert "2 mm of added position noise changes the results strongly" in said

@@ -4,7 +4,8 @@ from px4fuse.batch.changes import MAX_OMITTED_DIFFERENCE, MAX_OMITTED_RELATIVE_D
 from px4fuse.batch.page import SIGMA_RATIO_LABELS, LogSummary, sort_logs, summarise_logs
 from px4fuse.batch.rows import STATUS_FAILED
 from px4fuse.batch.run import BatchResult
-from px4fuse.core.text import format_count, format_number, format_ratio
+from px4fuse.core.text import capitalise_first, format_count, format_number, format_ratio
+from px4fuse.filter.signals import AISLE
 from px4fuse.report.card_text import SEVERITY_SIGNS
 from px4fuse.report.page import Cell, Page, styled_text
 from px4fuse.report.style import MUTED_COLOUR, SEVERITY_COLOURS
@@ -14,7 +15,6 @@ MAX_LISTED_REASONS = 8
 MAX_LISTED_LOGS = 40
 RATIO_NOTE = "Ratio of actual to reported σ: ● innovation ÷ √S, ◆ error ÷ σ (ground truth)"
 ERROR_COLOUR, WARNING_COLOUR = SEVERITY_COLOURS["error"], SEVERITY_COLOURS["warning"]
-NUMBER_TABLE_TITLES = ("number", "A", "95 %", "B", "95 %", "unit")
 
 
 def format_summary(batch_result: BatchResult) -> Page:
@@ -74,52 +74,47 @@ def format_differences(results: ChangeResults) -> Page:
         page.write_labelled(
             name, f"{diff_input.given} ({diff_input.kind}{log_text}), {version_text}"
         )
-    settings = [
-        (setting.name, _format_setting(setting.a), _format_setting(setting.b))
-        for setting in results.settings
-    ]
-    if settings:
-        page.add_table(("setting", "A", "B"), settings)
-    rows = []
-    for number in results.numbers:
-        display_factor, unit = (100.0, "%") if number.unit == "share" else (1.0, number.unit)
-        rows.append(
-            (
-                number.label,
-                _format_value(number.a, display_factor),
-                _format_interval(number.a_interval),
-                _format_value(number.b, display_factor),
-                _format_interval(number.b_interval),
-                unit,
-            )
-        )
-    if rows:
-        page.add_table(NUMBER_TABLE_TITLES, rows, right_aligned_columns=(1, 2, 3, 4))
-    tolerance_text = f"{100.0 * MAX_OMITTED_RELATIVE_DIFFERENCE:g} % or {MAX_OMITTED_DIFFERENCE:g}"
-    page.write_muted_text(f"Numbers that differ by less than {tolerance_text} are not listed.")
+    for text in results.worse:
+        page.write_labelled("Worse", styled_text(text, ERROR_COLOUR))
+    if not results.worse:
+        page.write("Each error and each inconsistent filter of B is also in A.")
     for finding in results.findings:
         styled_message = styled_text(
             f"{finding.severity}: {finding.message}", SEVERITY_COLOURS[finding.severity]
         )
         page.write_labelled(f"Only {finding.only_in}", styled_message)
-    for text in results.worse:
-        page.write_labelled("Worse", styled_text(text, ERROR_COLOUR))
-    if not results.worse:
-        page.write("Each error and each inconsistent filter of B is also in A.")
+    for setting in results.settings:
+        a_text, b_text = map(_format_setting, (setting.a, setting.b))
+        page.write(f"Setting {setting.name}, A → B: {a_text} → {b_text}")
+    # the axis of largest motion is sufficient for a summary
+    main_numbers = [
+        number
+        for number in results.numbers
+        if not number.path.startswith("axes.") or f".{AISLE}." in number.path
+    ]
+    for number in main_numbers or results.numbers:
+        a_text = _format_value(number.a, number.a_interval, number.unit)
+        b_text = _format_value(number.b, number.b_interval, number.unit)
+        label = capitalise_first(number.label.replace(AISLE, "axis of largest motion"))
+        page.write(f"{label}, A → B: {a_text} → {b_text}")
+    tolerance_text = f"{100.0 * MAX_OMITTED_RELATIVE_DIFFERENCE:g} % or {MAX_OMITTED_DIFFERENCE:g}"
+    page.write_muted_text(
+        f"Differences below {tolerance_text} are not listed. --json FILE lists the other axes too."
+    )
     return page
 
 
 def _format_setting(value: float | str | None) -> str:
-    return f"{value:.6g}" if isinstance(value, int | float) else value or "–"
+    return f"{value:.6g}" if isinstance(value, int | float) else value or "missing"
 
 
-def _format_value(value: float | None, factor: float) -> str:
-    return "" if value is None else format_number(factor * value)
-
-
-def _format_interval(interval: ConfidenceInterval | None) -> str:
+def _format_value(value: float | None, interval: ConfidenceInterval | None, unit: str) -> str:
+    if value is None:
+        return "missing"
+    factor, unit = (100.0, "%") if unit == "share" else (1.0, unit)
+    text = f"{format_number(factor * value)} {unit}".rstrip()
     if interval is None:
-        return ""
+        return text
     low, high = interval
-    low_text = format_number(low)
-    return f"above {low_text}" if high is None else f"{low_text} to {format_number(high)}"
+    high_text = "" if high is None else f" to {format_number(high)}"
+    return f"{text} (95 % {'above ' * (high is None)}{format_number(low)}{high_text})"

@@ -510,7 +510,7 @@ def _explain_differing_verdicts(
     if analysis.source.origin.may_drift:
         return (
             "The position noise is smaller than KF and EKF2 assume, so innovations are small. Only "
-            "ground truth shows the drift of the source."
+            "ground truth or a loop closure shows the drift of the source."
         )
     if "source_noise_time_correlated" in finding_ids:
         return (

@@ -90,8 +90,7 @@ def evaluate(
     results as JSON.
     """
     from px4fuse.loop.tracks import make_file_stem, read_source
-    from px4fuse.report.evaluation import write_evaluation
-    from px4fuse.report.page import Page
+    from px4fuse.report.evaluation import make_evaluation_page
     from px4fuse.results.build import make_evaluation_results
     from px4fuse.trajectory.evaluation import evaluate as evaluate_trajectory
 
@@ -128,6 +127,4 @@ def evaluate(
         contents = outputs.make_result_files(
             results, json_path, output, evaluation, show_progress, report_stem
         )
-    page = Page()
-    write_evaluation(page, evaluation)
-    outputs.write_and_print_results(contents, page)
+    outputs.write_and_print_results(contents, make_evaluation_page(evaluation))

@@ -220,10 +220,10 @@ def build_pose_graph(
 
 # Labels of the corrected paths, by their key in results.json
 CORRECTION_LABELS: Mapping[CorrectionName, str] = {
-    "uncorrected": "uncorrected",
-    "by_distance_plain": "positions corrected in proportion to distance flown",
-    "by_distance": "positions and headings corrected in proportion to distance flown",
-    "pose_graph_gated": "pose graph with loop closures that pass the gate",
+    "uncorrected": "uncorrected path",
+    "by_distance_plain": "positions corrected in proportion to distance",
+    "by_distance": "positions and headings corrected in proportion to distance",
+    "pose_graph_gated": "pose graph with accepted loop closures",
     "pose_graph_gnc": ROBUST_SOLUTION_LABEL,
 }
 # Corrected path with its pose graph solution, if any, or the reason why it is missing

@@ -24,7 +24,7 @@ from px4fuse.card.model import (
 from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import convert_nested, format_metres, format_ratio
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS, Reference
-from px4fuse.finding import format_spans
+from px4fuse.finding import MAX_LISTED_SPANS, format_spans
 from px4fuse.request import quote_command
 
 CARD_WIDTH = 100  # characters per line
@@ -285,7 +285,9 @@ def make_headline(card: Card) -> Paragraph:
 
 
 def _format_cause_lines(cause: DiagnosedCause, do_this: str) -> Iterator[Paragraph]:
-    yield _make_labelled_paragraph("when", format_spans(cause.spans_s))
+    is_shortened = len(cause.spans_s) > MAX_LISTED_SPANS
+    times_text = " (all times: spans_s in the JSON results)" * is_shortened
+    yield _make_labelled_paragraph("when", format_spans(cause.spans_s) + times_text)
     actions = [
         (prefix, action)
         for prefix, action in label_alternatives(cause)
@@ -397,7 +399,7 @@ def _format_verdict_lines(card: Card) -> Iterator[Paragraph]:
     )
     yield Paragraph(f"{legend:{AXIS_INDENT}}", plot=_format_tick_labels())
     if any(verdict.is_explained for verdict in card.verdicts):
-        yield Paragraph("  Verdicts in brackets require no change of filter settings.")
+        yield Paragraph("  Verdicts in brackets need no action.")
     yield from map(_format_verdict_line, card.verdicts)
 
 

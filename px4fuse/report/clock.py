@@ -97,7 +97,8 @@ def make_time_offset_advice(
         advice_by_label = {
             "Result": f"The position timestamps are {abs(offset_s):.3f} s {late_or_early}.",
             "Offset": f"Add {offset_text} to the timestamps of the position source.",
-            "Re-run": f"px4fuse compare LOG --clock-offset {suggested_offset_s:.3f}",
+            "Re-run": "Run again with corrected timestamps: px4fuse compare LOG "
+            f"--clock-offset {suggested_offset_s:.3f}",
         }
     elif not low_offset_s <= 0.0 <= high_offset_s:
         advice_by_label["Result"] = (

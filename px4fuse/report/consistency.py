@@ -49,8 +49,6 @@ MAX_DRAWN_SIGMAS = 4.0
 HISTOGRAM_EDGES = np.linspace(-MAX_DRAWN_SIGMAS, MAX_DRAWN_SIGMAS, 33)
 RUNNING_NIS_HEIGHT = 140.0  # points
 DISTRIBUTION_HEIGHT = 150.0  # points
-NOISE_TABLE_HEAD = ("axis", "SIGMA_A (m/s²)", "SIGMA_Z (m)")
-
 InnovationsByFilter = Mapping[str, "pd.Series[float]"]
 
 
@@ -89,13 +87,17 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     page.add_table(column_heads, rows, right_aligned_columns=(2, 5, 6, 7, 8))
     page.write_muted_text(VERDICT_LEGEND)
     noise_rows = [
-        [name, *map(format_noise_estimate, (tuning.sigma_a_two_state, tuning.sigma_z))]
+        [
+            name,
+            format_noise_estimate(tuning.sigma_a_two_state, "m/s²"),
+            format_noise_estimate(tuning.sigma_z, "m"),
+        ]
         for name, tuning in analysis.tuning.items()
         if isinstance(tuning, AxisTuning)
     ]
     if noise_rows:
         page.write_heading("Maximum-likelihood SIGMA_A and SIGMA_Z, with 95 % intervals")
-        page.add_table(NOISE_TABLE_HEAD, noise_rows, right_aligned_columns=(1, 2))
+        page.add_table(("axis", "SIGMA_A", "SIGMA_Z"), noise_rows)
     _write_causes(page, analysis)
     yield page
 

@@ -89,18 +89,8 @@ def describe_missing_explanation(analysis: Analysis) -> str:
 
 
 def format_replay_agreement(agreement: Agreement) -> str:
-    axis_texts = [
-        f"{name} correlation {axis.innovation_correlation:.4f}, replayed ÷ logged innovation "
-        f"variance S {axis.s_ratio_median:.3f} (5 to 95 % {axis.s_ratio_p5:.3f} to "
-        f"{axis.s_ratio_p95:.3f})"
-        for name, axis in agreement.axes.items()
-    ]
     sentences = [
         f"{'agrees' if agreement.good else 'does not agree'} with the log ({agreement.reason})",
-        f"Agreement of replayed and logged innovations ({agreement.samples} samples): "
-        f"{'; '.join(axis_texts)}",
-        f"Rejected samples: {agreement.rejected_fraction_replayed:.1%} in the replay, "
-        f"{agreement.rejected_fraction_logged:.1%} in the log",
         *(
             f"The replay of {AIDS[name].label} does not agree with the log and is not used: "
             f"{reason}"

@@ -35,7 +35,7 @@ def draw_pages(evaluation: Evaluation, _: object) -> Iterator[Page]:
         "APE: distance of one pose from the reference (its RMSE over all poses is "
         "the ATE). RPE: error of the relative motion over a fixed distance or time.",
     )
-    write_evaluation(page, evaluation)
+    _write_evaluation(page, evaluation)
     _draw_maps(page, evaluation)
     left_column, right_column = make_columns()
     _draw_ape(left_column, evaluation)
@@ -144,7 +144,7 @@ def _compute_time_origin_s(evaluation: Evaluation) -> float:
     return start_s if start_s > MIN_UNIX_TIME_S else 0.0
 
 
-def write_evaluation(page: Page, evaluation: Evaluation) -> None:
+def _write_evaluation(page: Page, evaluation: Evaluation) -> None:
     for label, track in (
         ("Estimate", evaluation.estimate_track),
         ("Against", evaluation.reference_track),
@@ -156,10 +156,9 @@ def write_evaluation(page: Page, evaluation: Evaluation) -> None:
             f"{track.frame}",
         )
     page.write_labelled("Method", describe_method(evaluation))
-    for text in evaluation.warnings:
-        page.write(text, bold=True, colour=style.SEVERITY_COLOURS["warning"])
-    head = ["error", "RMSE", "95 %", "mean", "median", "std", "max", "n", "rotation RMSE (°)"]
-    page.add_table(head, _make_error_rows(evaluation), right_aligned_columns=range(1, len(head)))
+    _write_warnings(page, evaluation)
+    head = "error", "RMSE", "mean (m)", "median (m)", "std (m)", "max (m)", "n", "rotation RMSE (°)"
+    page.add_table(head, _make_error_rows(evaluation), right_aligned_columns=range(2, len(head)))
     ate, rpe_translations = evaluation.ate, (error.translation_m for error in evaluation.rpe)
     missing_reasons = {
         f"No {quantity.what}: {quantity.reason}.": None
@@ -169,19 +168,47 @@ def write_evaluation(page: Page, evaluation: Evaluation) -> None:
     page.write_muted_text(" ".join([*missing_reasons, *evaluation.notes]))
 
 
+def make_evaluation_page(evaluation: Evaluation) -> Page:
+    """Make the terminal output of ``px4fuse evaluate``."""
+    page, tracks = Page(), (evaluation.estimate_track, evaluation.reference_track)
+    page.write(f"Errors of {' against '.join(track.name for track in tracks)}:")
+    for label, error_text, *_ in _make_error_rows(evaluation):
+        page.write(f"{label}: {error_text}")
+    _write_warnings(page, evaluation)
+    page.write_muted_text(
+        f"ATE: position RMSE after alignment ({evaluation.alignment}). RPE: RMSE of the change of "
+        "position."
+    )
+    return page
+
+
+def _write_warnings(page: Page, evaluation: Evaluation) -> None:
+    for text in evaluation.warnings:
+        page.write(text, bold=True, colour=style.SEVERITY_COLOURS["warning"])
+
+
 def _make_error_rows(evaluation: Evaluation) -> list[list[str]]:
-    error_by_name: dict[str, AbsoluteError | RelativeError] = {"ATE (m)": evaluation.ate}
-    error_by_name |= {f"RPE {error.delta_text} (m)": error for error in evaluation.rpe}
+    error_by_name: dict[str, AbsoluteError | RelativeError] = {"ATE": evaluation.ate}
+    error_by_name |= {f"RPE over {error.delta_text}": error for error in evaluation.rpe}
     rows = []
     for name, error in error_by_name.items():
-        errors_m, errors_deg = error.translation_m, error.rotation_deg
-        cells = ["–", *[""] * 6]
+        errors_m, cells = error.translation_m, [""] * 5
         if isinstance(errors_m, Statistics):
             numbers = (errors_m.mean, errors_m.median, errors_m.std, errors_m.max)
-            cells = [f"{errors_m.rmse:.4f}", format_interval(error.interval_m)]
-            cells += [*(f"{number:.4f}" for number in numbers), f"{errors_m.count}"]
-        rows.append([name, *cells, format_rmse(errors_deg, 2)])
+            cells = [*(f"{number:.3f}" for number in numbers), f"{errors_m.count}"]
+        rows.append([name, format_error(error), *cells, format_rmse(error.rotation_deg, 2)])
     return rows
+
+
+def format_error(error: AbsoluteError | RelativeError) -> str:
+    """Format the RMSE of positions with its 95 % interval."""
+    errors_m, interval = error.translation_m, error.interval_m
+    if isinstance(errors_m, Unavailable):
+        return "–"
+    interval_text = ""
+    if isinstance(interval, RmseInterval):
+        interval_text = f" (95 % {interval.low:.3f} to {interval.high:.3f})"
+    return f"{errors_m.rmse:.3f} m{interval_text}"
 
 
 def describe_unaligned_rmse(evaluation: Evaluation) -> str:
@@ -227,10 +254,6 @@ def describe_rpe_growth(rpe: tuple[RelativeError, ...]) -> str:
 
 def format_rmse(statistics: Statistics | Unavailable, digits: int) -> str:
     return f"{statistics.rmse:.{digits}f}" if isinstance(statistics, Statistics) else "–"
-
-
-def format_interval(interval: RmseInterval | Unavailable) -> str:
-    return f"{interval.low:.3f}–{interval.high:.3f}" if isinstance(interval, RmseInterval) else ""
 
 
 def describe_method(evaluation: Evaluation) -> str:

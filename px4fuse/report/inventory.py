@@ -17,34 +17,25 @@ def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
     page = Page()
     page.write(inventory.flight.log.name, bold=True)
     page.write_labelled_texts(dict(_describe_log(inventory)))
-    sender_rows = [
-        (
-            f"{sender.system}/{sender.component}",
-            sender.description + (" (this flight)" if sender.chosen else ""),
-            f"{sender.messages}",
-            "unknown" if sender.lost_fraction is None else f"{sender.lost_fraction:.1%}",
-        )
-        for sender in inventory.flight.log.senders
-    ]
-    if sender_rows:
-        sender_table_head = ("sender", "type", "messages", "lost")
-        page.add_table(sender_table_head, sender_rows, right_aligned_columns=(2, 3))
-    head = ("data", "topic", "", "", "", "")
-    page.add_table(head, [*_make_source_rows(inventory)], right_aligned_columns=(2, 3, 4, 5))
-    possible = "possible:", GOOD_COLOUR
-    impossible = "not possible:", SEVERITY_COLOURS["warning"]
-    rows = [
-        (possible if option.possible else impossible, option.name, option.reason)
-        for option in inventory.abilities
-    ]
-    page.add_table(("", "analysis", "data"), rows)
+    for option in inventory.abilities:
+        label = "Possible" if option.possible else "Not possible"
+        colour = GOOD_COLOUR if option.possible else SEVERITY_COLOURS["warning"]
+        page.write(f"{label}: {option.name} ({option.reason})", colour=colour)
     if inventory.abilities[0].possible:  # comparison of KF and EKF2
         command = command_line(request, "compare", for_shell=True)
         page.add("command", text=command, label="Run")
+    for advice in inventory.advice:
+        page.write_labelled("Action", f"{'; '.join(advice.improves)}: {advice.remedy}")
+    for sender in inventory.flight.log.senders:
+        lost_text = "unknown" if sender.lost_fraction is None else f"{sender.lost_fraction:.1%}"
+        page.write_labelled(
+            "Sender",
+            f"{sender.system}/{sender.component}, {sender.description}"
+            f"{' (this flight)' * sender.chosen}: {sender.messages} messages, lost: {lost_text}",
+        )
+    head = ("data", "topic", "samples", "rate", "gaps", "time in the log")
+    page.add_table(head, [*_make_source_rows(inventory)], right_aligned_columns=(2, 3, 5))
     texts_by_label = {
-        "Action": [
-            f"{advice.remedy} ({'; '.join(advice.improves)})" for advice in inventory.advice
-        ],
         "Clocks": [*map(format_clock_map, inventory.flight.clocks)],
         "Not used": [
             f"{topic.name}, {topic.count} messages: {topic.reason}"
@@ -100,7 +91,7 @@ def _make_source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
         yield (
             f"{source.part} (used)" if source.chosen else source.part,
             ("none", MUTED_COLOUR) if source.unavailable else f"{source.name}{note}",
-            "" if source.samples is None else format_count(source.samples, "sample"),
+            "" if source.samples is None else f"{source.samples}",
             "" if source.rate_hz is None else f"{_format_for_narrow_column(source.rate_hz)} Hz",
             _format_gaps(source),
             _format_time_span(source),

@@ -5,14 +5,25 @@ from collections.abc import Iterator
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.core.text import capitalise_first, format_number, format_p_value, join_first_names
+from px4fuse.core.text import (
+    capitalise_first,
+    format_count,
+    format_number,
+    format_p_value,
+    join_first_names,
+)
 from px4fuse.finding import Finding
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.loop.corrections import CORRECTION_LABELS
-from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
-from px4fuse.report.evaluation import describe_method, format_interval, format_rmse, plot_path
-from px4fuse.report.page import Cell, Page
+from px4fuse.loop.model import Loop
+from px4fuse.report.evaluation import (
+    describe_method,
+    format_error,
+    format_rmse,
+    plot_path,
+)
+from px4fuse.report.page import Page
 from px4fuse.report.phrases import write_findings
 from px4fuse.report.style import (
     EKF2_COLOUR,
@@ -29,7 +40,6 @@ from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 from px4fuse.trajectory.graph.solver import MAX_GNC_CLOSURES, SOLUTION_LABELS, Graph
 from px4fuse.trajectory.model import AXES_OF_FRAME, format_vector
-from px4fuse.trajectory.scores import RmseInterval, Statistics
 
 LEAD_TEXT = (
     "The closure error is the distance between the end of the odometry and the true end. "
@@ -64,18 +74,27 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
 
 
 def _write_page(page: Page, loop: Loop) -> None:
-    write_loop(page, loop)
+    page.write(_describe_closure_error(loop))
+    _write_segment(page, loop)
+    missing_reasons = {
+        f"No {correction.what}: {correction.reason}": None
+        for correction in loop.corrections.values()
+        if isinstance(correction, Unavailable)
+    }
+    for reason in missing_reasons:
+        page.write_muted_text(reason)
+    _write_ate(page, loop)
     axes = page.add_panel("Map in the frame of the odometry", MAP_HEIGHT)
     draw_map(axes, loop)
     page.add_legend(axes.get_legend_handles_labels()[0])
     page.write_heading("Loop closures and RPE")
     page.write_muted_text(
-        "d²: squared Mahalanobis distance of the closure error, given drift and closure noise. p: "
-        "probability that a true closure has a larger d²; the gate rejects a closure with p below "
-        f"{GATE_ALPHA:g}. Weight of GNC (graduated non-convexity): 1 for a used closure, 0 for an "
-        "excluded closure."
+        "p: probability that a true closure has a larger error, given drift and closure noise; "
+        f"the χ² test rejects p below {GATE_ALPHA:g}. Weight of GNC (graduated non-convexity): 1 "
+        "for a used closure, 0 for an excluded closure."
     )
-    write_closures_and_rpe(page, loop)
+    _write_closures(page, loop)
+    _write_rpe(page, loop)
 
 
 def draw_map(axes: Axes, loop: Loop) -> None:
@@ -112,80 +131,54 @@ def _draw_reference(axes: Axes, loop: Loop) -> None:
 def make_loop_page(loop: Loop, findings: tuple[Finding, ...]) -> Page:
     """Make the terminal output of ``px4fuse loop`` for a trajectory."""
     page = Page()
-    write_loop(page, loop)
-    write_closures_and_rpe(page, loop)
+    page.write(_describe_closure_error(loop))
+    _write_closures(page, loop)
+    _write_ate(page, loop)
     write_findings(page, findings)
+    _write_segment(page, loop)
     return page
 
 
-def write_loop(page: Page, loop: Loop) -> None:
-    """Write the loop closure error, and the ATE of each path."""
-    odometry = loop.odometry.trajectory
-    true_end = loop.true_end
-    page.write_labelled_texts(
-        {
-            "Track": f"{odometry.name}: {len(odometry)} poses, {loop.key_frames} key frames, "
-            f"spacing {loop.key_frame_spacing_m:.2g} m",
-            "Segment": f"{_format_span(loop)}, {loop.part_reason}",
-            "Closure": _describe_closure_error(loop),
-            "True end": "not used" if isinstance(true_end, Unavailable) else true_end.source,
-        }
-    )
-    missing_reasons = {
-        f"No {correction.what}: {correction.reason}": None
-        for correction in loop.corrections.values()
-        if isinstance(correction, Unavailable)
-    }
-    for reason in missing_reasons:
-        page.write_muted_text(reason)
-    reference_names = [reference.name for reference in loop.references]
-    head = [
-        "path",
-        "position correction",
-        *(f"ATE against {reference_name}" for reference_name in reference_names),
-    ]
-    rows = []
-    for path in loop.select_reported_paths():
-        correction_text = "–"
-        if path.correction_max_m:
-            correction_text = (
-                f"{path.correction_rms_m:.2f} m RMS, {path.correction_max_m:.2f} m maximum"
-            )
-        ate_texts = [
-            _format_error(evaluation.ate.translation_m, evaluation.ate.interval_m)
-            if isinstance(evaluation := path.scores[reference_name], Evaluation)
-            else "–"
-            for reference_name in reference_names
-        ]
-        rows.append([path.name, correction_text, *ate_texts])
-    page.add_table(head, rows)
-    page.write_muted_text(
-        "ATE: position RMSE after alignment, with its 95 % interval (block bootstrap)."
-        if reference_names
-        else "The error of the path is unknown. Add a reference trajectory with --reference FILE."
-    )
-
-
-def write_closures_and_rpe(page: Page, loop: Loop) -> None:
-    """Write tables of the loop closures and of the RPE."""
-    rows: list[list[Cell]] = []
-    for closure in loop.closures:
-        cells = [
-            _format_closure_times(closure, loop),
-            f"{closure.distance_m:.2f} m",
-            f"{closure.d2:.1f}",
-            f"{closure.degrees_of_freedom}",
-            format_p_value(closure.p).removeprefix("p "),
-            "accepted" if closure.accepted else "REJECTED",
-            "–" if closure.weight_gnc is None else f"{closure.weight_gnc:.2f}",
-        ]
-        colour = TEXT_COLOUR if closure.accepted else ERROR_COLOUR
-        rows.append([(cell, colour) for cell in cells])
-    if rows:
-        head = ["loop closure", "error", "d²", "degrees of freedom", "p", "gate", "GNC weight"]
-        page.add_table(head, rows, right_aligned_columns=(1, 2, 3, 4, 6))
+def _write_ate(page: Page, loop: Loop) -> None:
     for reference in loop.references:
-        page.write_heading(f"RPE against {reference.name}")
+        page.write(f"ATE against {reference.name} (position RMSE after alignment):")
+        for path in loop.select_reported_paths():
+            score = path.scores[reference.name]
+            text = score.reason if isinstance(score, Unavailable) else format_error(score.ate)
+            page.write(f"ATE, {path.name}: {text}")
+    if not loop.references:
+        page.write_muted_text(
+            "The error of the path is unknown. Add a reference trajectory with --reference FILE."
+        )
+
+
+def _write_segment(page: Page, loop: Loop) -> None:
+    odometry, true_end = loop.odometry.trajectory, loop.true_end
+    true_end_text = "not used" if isinstance(true_end, Unavailable) else true_end.source
+    page.write_labelled("True end", true_end_text)
+    page.write_labelled(
+        "Track",
+        f"{odometry.name}, {_format_span(loop)}, {loop.part_reason}: {len(odometry)} poses, "
+        f"{loop.key_frames} key frames, spacing {loop.key_frame_spacing_m:.2g} m",
+    )
+
+
+def _write_closures(page: Page, loop: Loop) -> None:
+    for closure in loop.closures:
+        verb = "accepted" if closure.accepted else "rejected"
+        text = (
+            f"{capitalise_first(f'{closure}'.removeprefix('the '))}: {verb} by the χ² test (error "
+            f"{closure.distance_m:.2f} m, {format_p_value(closure.p)})"
+        )
+        if closure.weight_gnc is not None:
+            text += f"; GNC weight {closure.weight_gnc:.2f}"
+        page.write(text, colour=TEXT_COLOUR if closure.accepted else ERROR_COLOUR)
+
+
+def _write_rpe(page: Page, loop: Loop) -> None:
+    """Write a table of the RPE of each path, for each reference."""
+    for reference in loop.references:
+        page.write_heading(f"RPE against {reference.name}, with 95 % intervals")
         head, rpe_rows, notes = list[str](), list[list[str]](), dict[str, None]()
         for path in loop.select_reported_paths():
             score = path.scores[reference.name]
@@ -193,12 +186,16 @@ def write_closures_and_rpe(page: Page, loop: Loop) -> None:
                 notes[score.reason] = None
                 continue
             if not rpe_rows:
-                head = ["path", *(error.delta_text for error in score.rpe), "ATE rotation RMSE (°)"]
+                deltas = (error.delta_text for error in score.rpe)
+                head = ["path", "RMS correction (m)", *deltas, "rotation RMSE (°)"]
                 notes |= dict.fromkeys((describe_method(score), *score.notes, *score.warnings))
-            rpe_texts = [
-                _format_error(error.translation_m, error.interval_m) for error in score.rpe
+            correction_text = f"{path.correction_rms_m:.2f}"
+            error_texts = [
+                format_error(error).replace(" (95 % ", "\n").replace(" to ", "–").rstrip(")")
+                for error in score.rpe
             ]
-            rpe_rows.append([path.name, *rpe_texts, format_rmse(score.ate.rotation_deg, 2)])
+            rotation_text = format_rmse(score.ate.rotation_deg, 2)
+            rpe_rows.append([path.name, correction_text, *error_texts, rotation_text])
         if rpe_rows:
             page.add_table(head, rpe_rows)
         for note in notes:
@@ -216,34 +213,18 @@ def _describe_closure_error(loop: Loop) -> str:
     length_m, heading_error_deg = loop.path_length_m, loop.heading_error_deg
     if error_m is None or error_components_m is None:
         if loop.is_assessed:
-            return f"closure error hidden in student assignments; path length {length_m:.1f} m"
-        return (
-            f"no closure error: --open states that the path ({length_m:.1f} m) does not return to "
-            "its start"
-        )
+            return f"Loop closure error hidden in student assignments; path length {length_m:.1f} m"
+        reason = f": {loop.true_end.reason}" if isinstance(loop.true_end, Unavailable) else ""
+        return f"No loop closure error{reason}; path length {length_m:.1f} m"
     heading_text = (
         f"heading error unknown: {heading_error_deg.reason}"
         if isinstance(heading_error_deg, Unavailable)
         else f"heading error {heading_error_deg:+.1f}°"
     )
     return (
-        f"error {error_m:.2f} m after a path of {length_m:.1f} m ({error_m / length_m:.2%}): "
-        f"{format_vector(error_components_m)}; {heading_text}"
+        f"Loop closure error {error_m:.2f} m after a path of {length_m:.1f} m "
+        f"({100.0 * error_m / length_m:.1f} %): {format_vector(error_components_m)}; {heading_text}"
     )
-
-
-def _format_closure_times(closure: Closure, loop: Loop) -> str:
-    if closure.source == LANDING_CLOSURE_SOURCE:
-        return "take-off and landing"
-    time_origin_s = loop.start_s if loop.start_s > MIN_UNIX_TIME_S else 0.0
-    return f"{closure.time_1_s - time_origin_s:.2f} s and {closure.time_2_s - time_origin_s:.2f} s"
-
-
-def _format_error(errors_m: Statistics | Unavailable, interval: RmseInterval | Unavailable) -> str:
-    if isinstance(errors_m, Unavailable):
-        return "–"
-    interval_text = format_interval(interval)
-    return f"{errors_m.rmse:.3f} m" + (f" ({interval_text})" if interval_text else "")
 
 
 def make_pose_graph_page(graph: Graph) -> Page:
@@ -295,15 +276,16 @@ def make_pose_graph_page(graph: Graph) -> Page:
                 "Robust",
                 "not solved, because the graph has many loop closures. Add --robust to solve it.",
             )
-    rows = []
     for key, solution in graph.solutions.items():
         label = SOLUTION_LABELS[key]
         if not solution.converged:
             not_converged_text = f"not converged: {label}. The cost is not at its minimum."
             page.write_labelled("Solver", not_converged_text)
-        costs = (f"{cost:.6g}" for cost in (solution.cost_initial, solution.cost))
-        dropped_count_text = "" if key == "all" else f"{solution.dropped}"
-        rows.append([label, *costs, f"{solution.iterations}", dropped_count_text])
-    head = ("path", "initial cost", "final cost", "iterations", "dropped closures")
-    page.add_table(head, rows, right_aligned_columns=(1, 2, 3, 4))
+        text = (
+            f"{capitalise_first(label)}: cost {solution.cost_initial:.6g} → {solution.cost:.6g} in "
+            f"{format_count(solution.iterations, 'iteration')}"
+        )
+        if key != "all":
+            text += f"; {format_count(solution.dropped, 'dropped loop closure')}"
+        page.write(text)
     return page

@@ -178,12 +178,12 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
         )
 
 
-def format_noise_estimate(noise: NoiseEstimate) -> str:
+def format_noise_estimate(noise: NoiseEstimate, unit: str) -> str:
     """Format a maximum-likelihood noise with its 95 % interval."""
     if noise.value is None:
         if noise.high is not None:
-            return f"at most {noise.high:.2g}"
-        return "not identifiable" if noise.low is None else f"at least {noise.low:.2g}"
-    lower_limit_text = "0" if noise.low is None else f"{noise.low:.2g}"
-    upper_limit_text = "?" if noise.high is None else f"{noise.high:.2g}"
-    return f"{noise.value:.3g} ({lower_limit_text}-{upper_limit_text})"
+            return f"at most {noise.high:.2g} {unit}"
+        return "not identifiable" if noise.low is None else f"at least {noise.low:.2g} {unit}"
+    low_text = f"{noise.low or 0:.2g}"
+    interval_text = f"above {low_text}" if noise.high is None else f"{low_text} to {noise.high:.2g}"
+    return f"{noise.value:.3g} {unit} (95 % {interval_text})"

@@ -14,54 +14,24 @@ from px4fuse.flight.model import Columns, Unavailable
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import format_noise_estimate, format_settings
 
-TUNING_HEAD = (
-    "axis",
-    "SIGMA_A (m/s²)\nestimate (95 %)",
-    "SIGMA_Z (m)\nestimate (95 %)",
-    "log-likelihood\ngain (nats per\nmeasurement)",
-    "log-likelihood\ngain, 2nd half\nof the flight",
-    "lag-1 auto-\ncorrelation of\ninnovations",
-)
-TUNING_NOTE = (
-    "Gain on the 2nd half: with SIGMA_A and SIGMA_Z estimated on the 1st half. Autocorrelation: "
-    "before → after tuning."
-)
-
 
 def make_tuning_page(
     comparison: PreparedComparison, tunings: Mapping[str, AxisTuning | Unavailable]
 ) -> Page:
     """Make a page on the estimates of SIGMA_A and SIGMA_Z along each axis."""
-    page, rows, sentences = Page(), [], list[str]()
+    page = Page()
     for name, tuning in tunings.items():
+        axis_name = name.replace(AISLE, "axis of largest motion")
         if isinstance(tuning, Unavailable):
-            sentences.append(f"{name}: {tuning.reason}. {tuning.remedy}")
+            page.write_muted_text(f"No estimate, {axis_name}: {tuning.reason}. {tuning.remedy}")
             continue
-        held_out_likelihood_gain_text = correlation_text = ""
-        if not isinstance(tuning.held_out, Unavailable):
-            held_out_likelihood_gain_text = (
-                f"{tuning.held_out.log_likelihood_gain_per_measurement:+.3f}"
-            )
-        if not isinstance(tuning.before, Unavailable) and not isinstance(tuning.after, Unavailable):
-            before, after = tuning.before.lag1_autocorrelation, tuning.after.lag1_autocorrelation
-            correlation_text = f"{before:+.2f} → {after:+.2f}"
-        rows.append(
-            [
-                name,
-                format_noise_estimate(tuning.sigma_a_two_state),
-                format_noise_estimate(tuning.sigma_z),
-                f"{tuning.log_likelihood_gain_per_measurement:.3f}",
-                held_out_likelihood_gain_text,
-                correlation_text,
-            ]
+        sigma_a, sigma_z = tuning.sigma_a_two_state, tuning.sigma_z
+        page.write(
+            f"Estimate, {axis_name}: SIGMA_A {format_noise_estimate(sigma_a, 'm/s²')}, "
+            f"SIGMA_Z {format_noise_estimate(sigma_z, 'm')}"
         )
-    page.write_labelled("KF", format_settings(comparison.settings))
-    if rows:
-        page.add_table(TUNING_HEAD, rows, right_aligned_columns=(1, 2, 3, 4, 5))
-        sentences.append(TUNING_NOTE)
-    for text in sentences:
-        page.write_muted_text(text)
     page.write_labelled_texts(dict(list_tuning_advice(comparison, tunings)))
+    page.write(f"KF in this run: {format_settings(comparison.settings)}")
     return page
 
 
@@ -76,6 +46,7 @@ def list_tuning_advice(
     if not tunings:
         return
     tuning, origin, settings = tunings[0], comparison.source.origin, comparison.settings
+    axis_name = tuning.name.replace(AISLE, "axis of largest motion")
     sigma_a, sigma_z = tuning.sigma_a_two_state, tuning.sigma_z
     noises = (
         ("--sigma-a", sigma_a, settings.sigma_a_m_s2),
@@ -105,7 +76,7 @@ def list_tuning_advice(
         )
     elif options:
         command = f"px4fuse compare LOG {' '.join(options)}"
-        yield "Action", f"Re-run with the estimated noise ({tuning.name}): {command}"
+        yield "Action", f"Re-run with the estimated noise ({axis_name}): {command}"
     if sigma_z.value is None and sigma_z.low is not None:
         yield (
             "SIGMA_Z",
@@ -130,21 +101,16 @@ def list_tuning_advice(
             else f"The estimate of SIGMA_A is at least {sigma_a.low:.2g} m/s²: logged acceleration "
             "and positions disagree.",
         )
-    elif (
-        tuning.biases_fitted
-        and (accelerometer_noise := tuning.sigma_a.value or tuning.sigma_a.high) is not None
-    ):
-        bound_text = "" if tuning.sigma_a.value is not None else "at most "
+    elif tuning.biases_fitted:
         yield (
             "SIGMA_A",
-            f"Accelerometer noise alone is {bound_text}{accelerometer_noise:.2g} m/s². The "
-            f"estimate of SIGMA_A, {sigma_a.value:.2g} m/s², also includes accelerometer bias and "
-            "tilt error, which are not states of KF.",
+            "The estimate of SIGMA_A includes accelerometer bias and tilt error, which are not "
+            "states of KF.",
         )
     if len(tuning.outlier_time_s):
         yield (
             "Outliers",
-            f"{len(tuning.outlier_time_s)} of {tuning.count} measurements ({tuning.name}) are "
+            f"{len(tuning.outlier_time_s)} of {tuning.count} measurements ({axis_name}) are "
             f"outliers, the first at {tuning.outlier_time_s[0]:.1f} s. The noise estimates exclude "
             "them.",
         )

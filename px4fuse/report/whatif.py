@@ -1,6 +1,7 @@
 """Terminal output of ``px4fuse whatif``: EKF2 replayed with other parameters."""
 
 import math
+from collections.abc import Iterator
 
 from px4fuse.analysis import WhatIfAnalysis
 from px4fuse.core.text import format_number
@@ -20,7 +21,8 @@ from px4fuse.report.page import Page
 NOT_PREDICTABLE_TEXT = "not predictable"
 
 
-def make_column_headings(analysis: WhatIfAnalysis) -> list[str]:
+def describe_changes(analysis: WhatIfAnalysis) -> str:
+    """Describe the changed parameters and omitted aiding sources; "" without a change."""
     change_texts = [
         f"{name} {format_number(value)} {PARAMETERS[name].unit}".rstrip()
         for name, value in analysis.changes.items()
@@ -28,93 +30,77 @@ def make_column_headings(analysis: WhatIfAnalysis) -> list[str]:
     change_texts += [
         f"without {name} from {start_s:g} s" for name, start_s in analysis.without.items()
     ]
-    headings = ["logged", "replayed as flown"]
-    if change_texts:
-        estimate_note = " (maximum-likelihood estimate)" if analysis.uses_estimates else ""
-        headings.append(f"replayed, changed: {', '.join(change_texts)}{estimate_note}")
-    return headings
+    estimate_note = " (maximum-likelihood estimate)" if analysis.uses_estimates else ""
+    return ", ".join(change_texts) + estimate_note if change_texts else ""
 
 
-def make_statistic_rows(analysis: WhatIfAnalysis) -> list[list[str]]:
-    """Return the statistics of EKF2 as logged, replayed, and replayed with other parameters."""
+def list_statistics(analysis: WhatIfAnalysis) -> Iterator[str]:
+    """Yield lines with the statistics of EKF2 as replayed, and with changed parameters."""
     result = analysis.statistics
-    texts_by_label = _format_statistics(result.replayed, result.replayed)
-    columns = [
-        _format_statistics(summary, result.replayed)
-        if summary.is_predictable
-        else dict.fromkeys(texts_by_label, NOT_PREDICTABLE_TEXT)
-        for summary in (
-            result.logged,
-            result.replayed,
-            *result.whatif[: analysis.sweep_start_index],
-        )
-    ]
-    return [[label, *(column.get(label, "n/a") for column in columns)] for label in texts_by_label]
+    columns, changes_text = [_format_statistics(result.replayed)], describe_changes(analysis)
+    for summary in result.whatif[: analysis.sweep_start_index]:
+        if summary.is_predictable:
+            columns.append(_format_statistics(summary))
+        else:
+            yield f"EKF2 (replay), {changes_text}: {NOT_PREDICTABLE_TEXT}"
+    spans_text = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in result.evaluated_s)
+    changed_text = f" → {changes_text}" * (len(columns) - 1)
+    yield f"{analysis.flight.log.name}, {spans_text}, EKF2 (replay) as flown{changed_text}:"
+    for label, (_, unit) in columns[0].items():
+        texts = [column.get(label, ("n/a", ""))[0] for column in columns]
+        if texts[0] != "n/a":
+            yield f"EKF2 (replay), {label} {' → '.join(texts)}{unit}"
 
 
-def _format_statistics(summary: Ekf2Statistics, replayed_summary: Ekf2Statistics) -> dict[str, str]:
-    text_by_label = dict[str, str]()
+def _format_statistics(summary: Ekf2Statistics) -> dict[str, tuple[str, str]]:
+    """Return value and unit of each statistic, by label."""
+    texts = dict[str, tuple[str, str]]()
     for name, axis in summary.axes.items():
-        text_by_label |= _format_nis_statistics(name, axis) | {
-            f"{name}: median σ_p (m)": _format_number(axis.sigma_p_median_m),
-            f"{name}: position RMSE (m)": _format_number(axis.position_rmse_to_truth_m),
+        rmse_text = _format_number(axis.position_rmse_to_truth_m)
+        texts |= {
+            f"{name}: position RMSE": (rmse_text, " m"),
+            f"{name}: mean NIS": _format_nis(axis),
+            f"{name}: median reported position σ": (_format_number(axis.sigma_p_median_m), " m"),
         }
-    text_by_label |= {"samples": f"{summary.samples}", **_format_fusion_statistics(summary)}
-    if summary.velocity_rejected_fraction is not None:
-        text_by_label["GNSS velocities rejected"] = f"{summary.velocity_rejected_fraction:.1%}"
-    if isinstance(replayed_summary.heading_error_mean_deg, float):
-        text_by_label["mean heading error (°)"] = _format_number(summary.heading_error_mean_deg, 1)
-    if replayed_summary.heights:
-        text_by_label["height RMSE (m)"] = _format_number(summary.height_rmse_to_truth_m)
+    gap_text = _format_number(summary.longest_without_fusion_s, 2)
+    texts |= {
+        "rejected positions": (_format_percent(summary.rejected_fraction), " %"),
+        "longest time without fusion": (gap_text, " s"),
+        "position resets": (f"{summary.resets}", ""),
+    }
+    if (rejected_fraction := summary.velocity_rejected_fraction) is not None:
+        texts["rejected GNSS velocities"] = _format_percent(rejected_fraction), " %"
+    texts["mean heading error"] = _format_number(summary.heading_error_mean_deg, 1), "°"
+    texts["height RMSE"] = _format_number(summary.height_rmse_to_truth_m), " m"
     for name, aid in {**summary.heights, **summary.others}.items():
         label = AIDS[name].label
-        text_by_label |= _format_nis_statistics(label, aid) | {
-            f"{label}: rejected": f"{aid.rejected_fraction:.1%}"
-        }
-    return text_by_label
+        texts[f"{label}: mean NIS"] = _format_nis(aid)
+        texts[f"{label}: rejected"] = _format_percent(aid.rejected_fraction), " %"
+    return texts
 
 
-def _format_nis_statistics(name: str, statistics: AxisStatistics | AidStatistics) -> dict[str, str]:
-    return {
-        f"{name}: mean NIS": format_number(statistics.nis_mean),
-        f"{name}: expected NIS": "{:.2f} to {:.2f}".format(*statistics.nis_band),
-        f"{name}: std of ν (m)": _format_number(statistics.innovation_std_m),
-    }
+def _format_nis(statistics: AxisStatistics | AidStatistics) -> tuple[str, str]:
+    band_text = " (expected {:.2f} to {:.2f})".format(*statistics.nis_band)
+    return format_number(statistics.nis_mean), band_text
 
 
-def _format_fusion_statistics(summary: Ekf2Statistics) -> dict[str, str]:
-    return {
-        "rejected": f"{summary.rejected_fraction:.1%}",
-        "longest time without fusion (s)": _format_number(summary.longest_without_fusion_s, 2),
-        "position resets": f"{summary.resets}",
-    }
+def _format_percent(fraction: float) -> str:
+    return f"{100.0 * fraction:.1f}"
 
 
-def make_sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
-    """Return headings and rows of a table: EKF2 statistics for each value of a parameter."""
-    parameter_name, rows = find_swept_parameter(analysis), []
-    unit = PARAMETERS[parameter_name].unit
+def list_sweep_results(analysis: WhatIfAnalysis) -> Iterator[str]:
+    """Yield a line with EKF2 statistics for each value of a parameter."""
     for summary in select_sweep_summaries(analysis):
-        axes = summary.axes.values()
-        cells = [
-            "/".join(format_number(axis.nis_mean) for axis in axes),
-            *_format_fusion_statistics(summary).values(),
-            "/".join(_format_number(axis.sigma_p_median_m) for axis in axes),
-            "/".join(_format_number(axis.position_rmse_to_truth_m) for axis in axes),
-        ]
-        if not summary.is_predictable:
-            cells = [NOT_PREDICTABLE_TEXT, *[""] * 5]
-        rows.append([format_number(summary.changed[parameter_name]), *cells])
-    head = [
-        f"{parameter_name} ({unit})" if unit else parameter_name,
-        "mean NIS N/E",
-        "rejected",
-        "longest gap (s)",
-        "resets",
-        "σ_p N/E (m)",
-        "RMSE N/E (m)",
-    ]
-    return head, rows
+        name = find_swept_parameter(analysis)
+        value_text = f"{name} {format_number(summary.changed[name])} {PARAMETERS[name].unit}"
+        text = NOT_PREDICTABLE_TEXT
+        if summary.is_predictable:
+            text = (
+                f"horizontal position RMSE {_format_number(summary.position_rmse_to_truth_m)} m, "
+                f"mean NIS {format_number(summary.nis_mean)}, "
+                f"rejected {_format_percent(summary.rejected_fraction)} %"
+            )
+        yield f"{value_text.rstrip()}: {text}"
 
 
 def select_sweep_summaries(analysis: WhatIfAnalysis) -> tuple[Ekf2Statistics, ...]:
@@ -165,24 +151,15 @@ def _format_number(value: float | Unavailable, digits: int = 3) -> str:
 
 def make_whatif_page(analysis: WhatIfAnalysis) -> Page:
     page = Page()
-    log, whatif_result = analysis.flight.log, analysis.statistics
-    page.write_labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
-    spans_text = ", ".join(
-        f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.evaluated_s
-    )
-    page.write_labelled("Segment", f"all statistics are from {spans_text}")
-    page.write_labelled("Replay", format_replay_agreement(whatif_result.agreement))
     if analysis.uses_estimates and not analysis.changes:
         no_change_text = (
             "The logged noise and delay parameters fit this log best. "
             "Test another value with --set NAME=VALUE."
         )
         page.write_labelled("Change", no_change_text)
-    head = ["", *make_column_headings(analysis)]
-    page.add_table(head, make_statistic_rows(analysis), right_aligned_columns=range(1, len(head)))
-    if select_sweep_summaries(analysis):
-        page.add_table(*make_sweep_table(analysis), right_aligned_columns=range(1, 7))
-    for line in describe_sweep(analysis):
+    lines = (*list_statistics(analysis), *describe_sweep(analysis), *list_sweep_results(analysis))
+    for line in lines:
         page.write(line)
+    page.write_labelled("Replay", format_replay_agreement(analysis.statistics.agreement))
     page.write("Replays use px4fuse's model of EKF2, not PX4's code.")
     return page
