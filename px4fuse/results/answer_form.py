@@ -32,14 +32,14 @@ EMPTY_CELL = "\u2013"
 class AllowedAnswers(Record):
     """Allowed answers to the questions of the answer form (``form.toml``)."""
 
-    behaviours: tuple[str, ...]
-    report_panels: tuple[str, ...]
+    behaviours: str
+    report_panels: str
     units: dict[str, dict[str, float]]
 
 
 _ALLOWED_ANSWERS = read_toml(__file__, AllowedAnswers, "form.toml")
-EKF2_BEHAVIOURS = _ALLOWED_ANSWERS.behaviours
-REPORT_PANELS = _ALLOWED_ANSWERS.report_panels
+EKF2_BEHAVIOURS = _ALLOWED_ANSWERS.behaviours.splitlines()
+REPORT_PANELS = _ALLOWED_ANSWERS.report_panels.splitlines()
 
 
 def _find_units(quantity: str) -> Mapping[str, float]:

@@ -427,25 +427,21 @@ def simulate_outliers(
         return outlier_error_m, is_outlier
     rng = make_random_generator(scenario, RandomStream.NLOS_OUTLIERS)
     burst_count = math.ceil(outlier_count / MEAN_OUTLIER_BURST_POSITION_COUNT)
-    # distribute the outliers over the bursts, at least one each, and the good positions over the
-    # intervals before, between and after the bursts
-    burst_lengths = 1 + rng.multinomial(
+    # lengths of good positions, burst, good positions, ..., burst, good positions; a burst has at
+    # least one outlier
+    run_lengths = np.empty(2 * burst_count + 1, np.intp)
+    run_lengths[1::2] = 1 + rng.multinomial(
         outlier_count - burst_count, np.full(burst_count, 1.0 / burst_count)
     )
-    good_position_counts_between_bursts = rng.multinomial(
+    run_lengths[::2] = rng.multinomial(
         len(airborne_indices) - outlier_count, np.full(burst_count + 1, 1.0 / (burst_count + 1))
     )
-    burst_index_by_outlier = np.repeat(np.arange(burst_count), burst_lengths)
-    # Index of an outlier: number of outliers and good positions before it
-    good_position_counts_before_bursts = np.cumsum(good_position_counts_between_bursts[:-1])
-    outlier_indices = airborne_indices[
-        np.arange(outlier_count) + good_position_counts_before_bursts[burst_index_by_outlier]
-    ]
-    angle_rad = rng.uniform(0.0, 2.0 * np.pi, burst_count)[burst_index_by_outlier]
+    is_burst = np.arange(len(run_lengths)) % 2 == 1
+    is_outlier[airborne_indices] = np.repeat(is_burst, run_lengths)
+    angle_rad = np.repeat(rng.uniform(0.0, 2.0 * np.pi, burst_count), run_lengths[1::2])
     size_m = faults.nlos_size_m * rng.uniform(0.5, 1.5, outlier_count)
-    outlier_error_m[outlier_indices, 0] = size_m * np.cos(angle_rad)
-    outlier_error_m[outlier_indices, 1] = size_m * np.sin(angle_rad)
-    is_outlier[outlier_indices] = True
+    outlier_error_m[is_outlier, 0] = size_m * np.cos(angle_rad)
+    outlier_error_m[is_outlier, 1] = size_m * np.sin(angle_rad)
     return outlier_error_m, is_outlier
 
 

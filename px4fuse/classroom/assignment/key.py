@@ -51,7 +51,7 @@ MIN_RESET_M = 0.2
 # Time (s) at the start in which position resets are ignored: EKF2 resets to its first position
 INITIAL_TIME_WITHOUT_RESETS_S = 5.0
 # Faults for which a student must ("required") or may ("allowed") report a behaviour of EKF2
-EKF2_BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, tuple[str, ...]]], "did.toml")
+EKF2_BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, str]], "did.toml")
 # Maximum size (bytes) of an answer key: the key of 1000 students has 2 million bytes
 MAX_KEY_BYTES = 20_000_000
 ANSWER_KEY_NOTE = (
@@ -311,7 +311,7 @@ def _find_ekf2_behaviours(
         return [
             behaviour
             for behaviour, rule_kinds in EKF2_BEHAVIOUR_RULES[rule].items()
-            if not kinds.isdisjoint(rule_kinds)
+            if not kinds.isdisjoint(rule_kinds.split())
         ]
 
     required, allowed = list_behaviours("required"), list_behaviours("allowed")

@@ -30,7 +30,10 @@ MAX_STEM_LENGTH = 48
 WINDOWS_RESERVED_NAMES = {"con", "prn", "aux", "nul"} | {
     f"{n}{i}" for n in ("com", "lpt") for i in range(10)
 }
-TITLES_BY_FIELD = read_toml(__file__, dict[str, tuple[str, ...]], "columns.toml")
+TITLES_BY_FIELD = {
+    field_name: titles.split()
+    for field_name, titles in read_toml(__file__, dict[str, str], "columns.toml").items()
+}
 # Fields that are copied from other tables if the class list lacks them
 FIELDS_FROM_OTHER_TABLES = ("name", "email", "login", "submission_time", "extended_due")
 # Names in Canvas gradebooks that are not students ("Points Possible", "Student, Test")

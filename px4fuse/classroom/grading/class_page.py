@@ -189,9 +189,9 @@ def _make_grade_details(grade: Grade) -> Iterator[RowDetailsSection]:
 def _make_points_cell(grade: Grade) -> Cell:
     report = grade.counted_report
     if grade.total is None:
-        if report is None:
+        # pending: the points wait for a decision of the instructor
+        if report is None or report.counted_points is not None:
             return Cell("–")
-        # the points wait for a decision of the instructor
         return Cell("pending", None, f"{format_cell_number(report.points)} proposed")
     notes = []
     if grade.deducted_points:

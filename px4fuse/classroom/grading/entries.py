@@ -153,10 +153,6 @@ class _Candidate(NamedTuple):
     report: GradedReport
     grade: Grade
 
-    @property
-    def points_after_deduction(self) -> float:
-        return max(self.report.points - self.grade.deducted_points, 0.0)
-
 
 def build_grades(
     reports: Sequence[GradedReport],
@@ -337,7 +333,8 @@ def _choose_counted_report(candidates: Sequence[_Candidate], course: Course) -> 
     eligible = final or readable or candidates
 
     def rank(candidate: _Candidate) -> tuple[float, float, str]:
-        time_s, points = candidate.time_s, candidate.points_after_deduction
+        points = max(candidate.report.points - candidate.grade.deducted_points, 0.0)
+        time_s = candidate.time_s
         criteria = {
             "latest": (time_s, points),
             "first": (-time_s, points),

@@ -82,7 +82,7 @@ class CorrectionRule(Record):
 
 CORRECTION_RULES = read_csv(__file__, CorrectionRule, "corrections.csv")
 POINTS_CONFIG = read_toml(__file__, dict)
-SIMILAR_FAULT_GROUPS = [set(kinds) for kinds in POINTS_CONFIG["neighbours"].values()]
+SIMILAR_FAULT_GROUPS = [set(kinds.split()) for kinds in POINTS_CONFIG["neighbours"].values()]
 FORM_PART_NAMES = tuple(POINTS_CONFIG["weights"])
 
 
@@ -270,7 +270,7 @@ def score_fault_kind(kind: str, named_kind: str) -> float:
         return SCORE_FOR_WRONG_NOISE_PARAMETER
     if any({kind, named_kind} <= group for group in SIMILAR_FAULT_GROUPS):
         return SCORE_FOR_SIMILAR_FAULT
-    is_consequence = named_kind in POINTS_CONFIG["effects"].get(kind, ())
+    is_consequence = named_kind in POINTS_CONFIG["effects"].get(kind, "").split()
     return SCORE_FOR_NAMED_CONSEQUENCE if is_consequence else 0.0
 
 
@@ -337,7 +337,7 @@ def score_evidence(fault: InjectedFault, named_fault: NamedFault) -> float:
 
 def find_panels_showing_fault(fault_kind: str) -> list[str]:
     return [
-        *(panel for panel, kinds in POINTS_CONFIG["shows"].items() if fault_kind in kinds),
+        *(panel for panel, kinds in POINTS_CONFIG["shows"].items() if fault_kind in kinds.split()),
         "cover",
     ]
 
