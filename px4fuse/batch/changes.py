@@ -226,24 +226,29 @@ def collect_compared_numbers(results: Results) -> dict[str, ComparedNumber]:
     """Return the numbers that ``px4fuse diff`` compares, by path (``clock.offset_s``)."""
     axes = {} if isinstance(results, AidsResults) else results.axes
     # EKF2 rejects north and east together, so their rejected fractions are equal: keep only one
-    first_horizontal_axis = next((name for name in ("north", "east", AISLE) if name in axes), "")
-    # the axes already contain the numbers of the aiding source that measured the positions
-    aids_of_position_source: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
+    horizontal_axes = [name for name in ("north", "east", AISLE) if name in axes]
+    omitted_paths = [f"axes.{name}.rejected_fraction" for name in horizontal_axes[1:]]
+    # the axes already contain the numbers of the aiding source that measured the positions; EKF2
+    # fuses all positions except those of GNSS as external vision
     if find_value(results, "source.kind") == "gnss":
-        aids_of_position_source = ("gnss_pos",)
+        omitted_paths.append("aids.gnss_pos.")
+    elif axes:
+        omitted_paths += ["aids.ev_pos.", "aids.ev_hgt."]
     numbers_by_path: dict[str, ComparedNumber] = {}
     for definition in COMPARED_NUMBER_DEFINITIONS:
-        pattern, interval_field = definition["path"], definition["interval"]
-        for path, keys in _find_matching_paths(results, pattern):
+        interval_field = definition["interval"]
+        for path, keys in _find_matching_paths(results, definition["path"]):
             record_path, _, field_name = path.rpartition(".")
-            record, first_key = find_value(results, record_path), keys[0] if keys else ""
+            record = find_value(results, record_path)
             value = getattr(record, field_name, None)
-            is_undetermined = isinstance(record, SourceTimeOffset) and not record.is_determinable
-            is_undetermined |= isinstance(record, HeadingError) and record.drifts
-            is_duplicate = pattern.startswith("aids.") and first_key in aids_of_position_source
-            if pattern == "axes.*.rejected_fraction":
-                is_duplicate = first_key not in (first_horizontal_axis, "down")
-            if is_undetermined or is_duplicate or not isinstance(value, int | float):
+            is_undetermined = (
+                isinstance(record, SourceTimeOffset) and not record.is_determinable
+            ) or (isinstance(record, HeadingError) and record.drifts)
+            if (
+                is_undetermined
+                or path.startswith(tuple(omitted_paths))
+                or not isinstance(value, int | float)
+            ):
                 continue
             labels = (AIDS[name].label if name in AIDS else name for name in keys)
             numbers_by_path[path] = ComparedNumber(

@@ -120,5 +120,5 @@ def _run_task(
     """Run the jobs of one Dask task in sequence, in a child process of the Dask worker."""
     # Python does not allow daemon processes, such as Dask workers, to start processes
     multiprocessing.current_process().daemon = False
-    results_by_index = dict(run_job_list(jobs, process_count=1))
-    return [results_by_index[index] for index in range(len(jobs))]
+    # one process finishes the jobs in their order
+    return [result for _, result in run_job_list(jobs, process_count=1)]

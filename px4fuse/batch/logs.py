@@ -64,40 +64,36 @@ def _find_pattern_logs(pattern: str) -> list[LogAddress]:
         raise SettingsError("the name of a log is empty", "Give files, folders, globs or URLs.")
     file_system, root_path = _open_file_system(pattern)
     is_local = _is_local(file_system)
-    suffixes: tuple[str, ...] = ("",)
     try:
-        if file_system.isdir(root_path):
-            suffixes = LOG_SUFFIXES
-            info_by_path = file_system.find(root_path, detail=True)
-        # include devices and pipes, which a worker process rejects with a message
-        elif file_system.exists(root_path):
+        if file_system.exists(root_path) and not file_system.isdir(root_path):
+            # also a device or pipe, which a worker process rejects with a message
             is_file = file_system.isfile(root_path)
-            info_by_path = {root_path: file_system.info(root_path) if is_file else {}}
+            size_by_path = {root_path: file_system.size(root_path) if is_file else None}
         else:
-            info_by_path = file_system.glob(root_path, detail=True)
-        info_by_path = {
-            path: file_info
-            for path, file_info in info_by_path.items()
-            if path.lower().endswith(suffixes) and file_info.get("type", "file") == "file"
-        }
+            is_folder = file_system.isdir(root_path)
+            list_files = file_system.find if is_folder else file_system.glob
+            size_by_path = {
+                path: file_info.get("size")
+                for path, file_info in list_files(root_path, detail=True).items()
+                if file_info.get("type", "file") == "file"
+                and (not is_folder or path.lower().endswith(LOG_SUFFIXES))
+            }
     # fsspec raises exceptions of many types, for example for an unknown account
     except Exception as error:
         raise SettingsError(
             f"{pattern}: cannot be read ({one_line(str(error), 200) or type(error).__name__})."
         ) from error
-    if not info_by_path:
+    if not size_by_path:
         raise SettingsError(
             f"{pattern}: no logs found",
             f"Give existing logs, or folders with logs ({', '.join(LOG_SUFFIXES)}).",
         )
     found_logs = []
-    for path, file_info in info_by_path.items():
+    for path, size_bytes in size_by_path.items():
         address = path if is_local else file_system.unstrip_protocol(path)
         is_relative_path = is_local and not Path(pattern).is_absolute()
         path_for_table = os.path.relpath(path) if is_relative_path else address
-        found_logs.append(
-            LogAddress(_file_name(path), path_for_table, address, file_info.get("size"))
-        )
+        found_logs.append(LogAddress(_file_name(path), path_for_table, address, size_bytes))
         if is_local:
             add_input(Path(path))
     return found_logs

@@ -1,7 +1,7 @@
 """Web page of ``px4fuse batch``: a sortable table with one row per log."""
 
 import math
-from collections import Counter, defaultdict
+from collections import ChainMap, Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import zip_longest
 from typing import Any
@@ -53,8 +53,6 @@ LOG_COLUMNS = (
 )
 # Group of columns that the page hides until the user clicks on "more columns"
 OPTIONAL_COLUMN_GROUP = "numbers"
-# Labels of the drop-down lists that select logs; a tag is label and value, such as "Status:done"
-DROP_DOWN_LABELS = ("Diagnosis", "Status", "Vehicle", "Firmware", "Finding", "Action")
 # Order of preference: the page shows the numbers of the first of these axes that a log has
 AXES_BY_PREFERENCE = ("aisle", "north", "east", "down")
 
@@ -77,7 +75,11 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
     rows = [
         Row(
             _make_log_cells(log),
-            tuple(log["tags"]),
+            tuple(
+                f"{label}:{value}"
+                for label, values in log["filter_values"].items()
+                for value in values
+            ),
             _make_log_details(log),
             _make_file_and_flight_sections(log),
         )
@@ -204,16 +206,18 @@ def _format_value(value: str | float) -> str:
 
 def _make_drop_down_lists(logs: Sequence[LogSummary]) -> list[tuple[str, list[tuple[str, str]]]]:
     """Return the lists that filter logs: label, and options (tag, text), most frequent first."""
-    counts = Counter(tag_and_value for log in logs for tag_and_value in log["tags"].items())
+    counts_by_label: dict[str, Counter[str]] = defaultdict(Counter)
+    for log in logs:
+        for label, values in log["filter_values"].items():
+            counts_by_label[label].update(values)
     drop_down_lists = []
-    for list_label in DROP_DOWN_LABELS:
+    for label, counts in counts_by_label.items():
         options = [
-            (tag, f"{one_line(value, 60)} ({count})")
-            for (tag, value), count in counts.most_common()
-            if tag.startswith(f"{list_label}:")
+            (f"{label}:{value}", f"{one_line(value, 60)} ({count})")
+            for value, count in counts.most_common()
         ]
         if options:
-            drop_down_lists.append((list_label, [("", "All"), *options]))
+            drop_down_lists.append((label, [("", "All"), *options]))
     return drop_down_lists
 
 
@@ -230,46 +234,44 @@ def summarise_logs(table: pd.DataFrame) -> list[LogSummary]:
     return [_summarise_log(rows) for rows in rows_by_log.values()]
 
 
-def _summarise_log(rows: Sequence[Mapping[str, Any]]) -> LogSummary:
+def _summarise_log(rows: list[dict[str, Any]]) -> LogSummary:
     """Combine the table rows of one log, one per axis, into one summary.
 
     The summary contains the values of the preferred axis, and values that combine all axes.
     """
-    summary: dict[str, Any] = {}
-    # The preferred axis is last, so its values replace those of the other axes
-    for row in sorted(
-        rows, key=lambda row: AXES_BY_PREFERENCE.index(row.get("axis", "aisle")), reverse=True
-    ):
-        summary |= row
+    # the values of the first row, and those that only later rows contain
+    summary: dict[str, Any] = dict(
+        ChainMap(*sorted(rows, key=lambda row: AXES_BY_PREFERENCE.index(row.get("axis", "aisle"))))
+    )
+    # one axis with results is sufficient
     is_done = any(row["status"] == STATUS_DONE for row in rows)
-    reasons_and_remedies = ((row.get("reason", ""), row.get("remedy", "")) for row in rows)
-    status = STATUS_DONE if is_done else rows[0]["status"]
-    if "headline" not in summary:
-        status_text = status if status == STATUS_NOT_COMPARED else "refused"
+    summary["status"] = STATUS_DONE if is_done else rows[0]["status"]
+    if "headline" not in summary:  # a log without results
+        is_refused = summary["status"] != STATUS_NOT_COMPARED
+        status_text = "refused" if is_refused else STATUS_NOT_COMPARED
         summary |= {
             "severity": "refused",
             "headline": f"{status_text}: {summary.get('reason', '')}",
             "action": summary.get("remedy", ""),
         }
+    reasons_and_remedies = ((row.get("reason", ""), row.get("remedy", "")) for row in rows)
     summary |= {
-        "status": status,
         "missing_results": tuple(dict.fromkeys(pair for pair in reasons_and_remedies if any(pair))),
         "axes": [row for row in rows if "axis" in row],
         "findings": [id_ for id_ in summary.get("findings", "").split(FINDING_SEPARATOR) if id_],
         "verdicts": summary.get("verdicts", "").split(FINDING_SEPARATOR),
     }
-    return summary | {"tags": _make_log_tags(summary)}
+    return summary | {"filter_values": _list_filter_values(summary)}
 
 
-def _make_log_tags(log: LogSummary) -> dict[str, str]:
-    values_by_label = {
+def _list_filter_values(log: LogSummary) -> dict[str, list[str]]:
+    """Return the values by which the page filters logs, by label of the drop-down list."""
+    actions = [remedy or "no action" for _, remedy in log["missing_results"]]
+    return {
         "Diagnosis": [log["severity"]],
         "Status": [log["status"]],
         "Vehicle": [log.get("vehicle", "vehicle unknown")],
         "Firmware": [log.get("firmware", "firmware unknown")],
-        "Finding": map(finding_title, log["findings"]),
-        "Action": [remedy or "no action" for _, remedy in log["missing_results"]],
-    }
-    return {
-        f"{label}:{value}": value for label, values in values_by_label.items() for value in values
+        "Finding": list(dict.fromkeys(map(finding_title, log["findings"]))),
+        "Action": list(dict.fromkeys(actions)),
     }

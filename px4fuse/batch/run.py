@@ -182,6 +182,8 @@ def run(
         raise SettingsError("A position file belongs to one flight. Omit `position` for many logs.")
     requested_settings(request)  # raises SettingsError if a setting is out of range
     state = _RunState(output, metadata.version("px4fuse"), command_line(request))
+    # a worker process computes the SHA-256 of a log, and compares it only with finished logs of the
+    # same size: a set of all finished logs would be large
     hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
     for cached_rows in load_cached_rows(state, reports):
         state.cached_rows_by_hash[cached_rows.sha256] = cached_rows
@@ -209,6 +211,7 @@ def run(
             resume_note = RESUME_NOTE if (output / "rows").is_dir() else ""
             raise type(error)(f"{error} {resume_note}".rstrip()) from error
         finally:
+            # also after an error or an interruption: write the results so far
             if state.hash_by_log_address or state.failed_row_by_log_address:
                 batch_result = _write_table(state, logs)
     return batch_result
@@ -222,11 +225,13 @@ def load_cached_rows(state: _RunState, reports: bool) -> Iterator[CachedRows]:
     for cache_file in sorted((state.output / "rows").glob("*.json")):
         try:
             cached_rows = msgspec.json.decode(cache_file.read_bytes(), type=CachedRows)
-        except (OSError, msgspec.MsgspecError):
+        except (OSError, ValueError):
             continue  # an unreadable file is ignored, and the log is compared again
         first_row = cached_rows.rows[0]
-        output_file_columns = OUTPUT_FILE_COLUMNS[: 1 + reports] if "axis" in first_row else ()
-        output_files = [state.output / first_row.get(column, "") for column in output_file_columns]
+        output_columns: tuple[str, ...] = ()
+        if "axis" in first_row:  # the log was compared, so it has output files
+            output_columns = OUTPUT_FILE_COLUMNS if reports else OUTPUT_FILE_COLUMNS[:1]
+        output_files = [state.output / first_row.get(column, "") for column in output_columns]
         if (cached_rows.px4fuse, cached_rows.settings) == (state.version, state.settings) and all(
             file.is_file() for file in output_files
         ):

@@ -20,18 +20,18 @@ ERROR_COLOUR, WARNING_COLOUR = SEVERITY_COLOURS["error"], SEVERITY_COLOURS["warn
 def format_summary(batch_result: BatchResult) -> Page:
     """Format diagnoses and σ ratios (actual ÷ reported σ), and reasons for missing results."""
     page, logs = Page(), batch_result.table.drop_duplicates("log")
-    logs_by_failure_reason = logs[logs["axis"] == ""].groupby(
-        ["status", "reason", "remedy"], sort=False
-    )["log"]
-    reason_table = logs_by_failure_reason.agg(["count", "first"]).reset_index()
-    sorted_reasons = reason_table.sort_values("count", ascending=False, kind="stable")
-    for reason in sorted_reasons.head(MAX_LISTED_REASONS).to_dict("records"):
-        template = "{first}: {status}: {reason}. {remedy}"
-        if reason["count"] > 1:
-            template = f"{{count}} logs without results, for example {template}"
-        colour = ERROR_COLOUR if reason["status"] == STATUS_FAILED else WARNING_COLOUR
-        page.write(template.format_map(reason).rstrip(), colour=colour)
-    if (unlisted_count := len(reason_table) - MAX_LISTED_REASONS) > 0:
+    # a log without results has one row, with an empty axis
+    logs_by_reason = sorted(
+        logs[logs["axis"] == ""].groupby(["status", "reason", "remedy"], sort=False)["log"],
+        key=lambda reason_and_logs: len(reason_and_logs[1]),
+        reverse=True,
+    )
+    for (status, reason, remedy), failed_logs in logs_by_reason[:MAX_LISTED_REASONS]:
+        text = f"{failed_logs.iloc[0]}: {status}: {reason}. {remedy}".rstrip()
+        if len(failed_logs) > 1:
+            text = f"{len(failed_logs)} logs without results, for example {text}"
+        page.write(text, colour=ERROR_COLOUR if status == STATUS_FAILED else WARNING_COLOUR)
+    if (unlisted_count := len(logs_by_reason) - MAX_LISTED_REASONS) > 0:
         page.write(f"fleet.html also lists {unlisted_count} other reasons for missing results.")
     sorted_logs = sort_logs(summarise_logs(batch_result.table))
     if sorted_logs:

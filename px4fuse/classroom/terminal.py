@@ -40,12 +40,14 @@ def assignment_page(key: AnswerKey, folder: Path, key_file: Path, written_count:
 
 def grading_page(outcome: GradeOutcome) -> Page:
     """Format a table of the students with their points, and the reasons for pending points."""
-    page, rows = Page(), []
+    page, rows, pending_texts = Page(), [], []
     for grade in outcome.grades:
         report = grade.counted_report
         status = report.status if report else "missing"
         if report and grade.total is None:
             status += ", pending"
+            name = one_line(grade.display_name, 60)
+            pending_texts.append(f"{name}: {report.pending_actions}")
         colour = GOOD_COLOUR if status == "verified" else SEVERITY_COLOURS["warning"]
         points_text = "–" if grade.total is None else f"{grade.total:g}"
         rows.append(
@@ -68,10 +70,6 @@ def grading_page(outcome: GradeOutcome) -> Page:
         f"{format_count(missing_student_count, 'student')}; {outcome.reused_count} submissions "
         "verified in an earlier run"
     )
-    for grade in outcome.grades:
-        if (report := grade.counted_report) and grade.total is None:
-            name = one_line(grade.display_name, 60)
-            page.write_muted_text(f"{name}: {report.pending_actions}")
-    for note in outcome.notes:
-        page.write_muted_text(note)
+    for text in (*pending_texts, *outcome.notes):
+        page.write_muted_text(text)
     return page

@@ -32,14 +32,14 @@ EMPTY_CELL = "\u2013"
 class AllowedAnswers(Record):
     """Allowed answers to the questions of the answer form (``form.toml``)."""
 
-    behaviours: tuple[str, ...]
-    report_panels: tuple[str, ...]
+    behaviours: str
+    report_panels: str
     units: dict[str, dict[str, float]]
 
 
 _ALLOWED_ANSWERS = read_toml(__file__, AllowedAnswers, "form.toml")
-EKF2_BEHAVIOURS = _ALLOWED_ANSWERS.behaviours
-REPORT_PANELS = _ALLOWED_ANSWERS.report_panels
+EKF2_BEHAVIOURS = _ALLOWED_ANSWERS.behaviours.splitlines()
+REPORT_PANELS = _ALLOWED_ANSWERS.report_panels.splitlines()
 
 
 def _find_units(quantity: str) -> Mapping[str, float]:
@@ -69,6 +69,11 @@ class FaultKind(Record):
     @property
     def units(self) -> Mapping[str, float]:
         return _find_units(self.quantity)
+
+    @property
+    def standard_unit(self) -> str:
+        """First allowed unit; "" for a fault without size."""
+        return next(iter(self.units), "")
 
 
 FAULT_KINDS = {fault.kind: fault for fault in read_csv(__file__, FaultKind, "fault_kinds.csv")}
@@ -119,7 +124,7 @@ class Choice(Record):
     options: tuple[str, ...]
 
     def answer_text(self, letter: str) -> str:
-        return self.options[CHOICE_LETTERS.index(letter)]
+        return self.options[CHOICE_LETTERS.index(letter)] if letter else ""
 
     @property
     def text(self) -> str:
@@ -218,7 +223,7 @@ class FormQuestion(Record):
     update_number : int
         Number of the KF update, from 1. The first measurement only sets the state.
     question_parameter : float
-        Duration (s) of the prediction, or innovation gate (in √S).
+        Duration (s) of the prediction, or innovation gate (in √S); not used by other kinds.
     """
 
     kind: QuestionKind
@@ -249,22 +254,30 @@ GATE_QUESTION_FURTHER_UPDATES = 20
 
 
 def select_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
-    """Select three questions about KF at random, with the SHA-256 of the log as seed."""
+    """Select three questions about KF at random, with the SHA-256 of the log as seed.
+
+    Each random choice uses the next byte of a hash. A change of their order would change the
+    questions of existing answer keys.
+    """
     random_bytes = iter(hashlib.sha256(f"px4fuse answers {log_sha256}".encode()).digest())
 
     def draw_number_between(low: float, high: float, decimals: int) -> float:
         return round(low + (high - low) * next(random_bytes) / 255.0, decimals)
 
     sigmas = (draw_number_between(0.2, 0.45, 2), draw_number_between(0.06, 0.14, 3))
-    first_kind, second_kind, third_kind = (
-        pair[next(random_bytes) % 2] for pair in _QUESTION_KIND_PAIRS
+    kinds = [pair[next(random_bytes) % 2] for pair in _QUESTION_KIND_PAIRS]
+    # duration (s) of a prediction, or innovation gate (in √S)
+    parameter_range = (1.0, 4.0) if "prediction" in kinds else (0.8, 1.3)
+    parameter = draw_number_between(*parameter_range, 1)
+    # the first question is about an early update, where the covariance still changes
+    update_numbers = (
+        2 + next(random_bytes) % 7,
+        20 + next(random_bytes) % 130,
+        20 + next(random_bytes) % 100,
     )
-    parameter_range = (1.0, 4.0) if third_kind == "prediction" else (0.8, 1.3)
-    question_parameter = draw_number_between(*parameter_range, 1)
-    return (
-        FormQuestion(first_kind, 2 + next(random_bytes) % 7, *sigmas),
-        FormQuestion(second_kind, 20 + next(random_bytes) % 130, *sigmas),
-        FormQuestion(third_kind, 20 + next(random_bytes) % 100, *sigmas, question_parameter),
+    return tuple(
+        FormQuestion(kind, update_number, *sigmas, parameter)
+        for kind, update_number in zip(kinds, update_numbers, strict=True)
     )
 
 
@@ -284,7 +297,7 @@ def read_answers(path: Path) -> Answers:
         form_values = _convert_form(tomllib.loads(form_toml))
         answers = msgspec.convert(form_values, Answers)
         check_answers(answers)
-    except (tomllib.TOMLDecodeError, RecursionError, msgspec.ValidationError, ValueError) as error:
+    except (RecursionError, ValueError) as error:  # of tomllib, msgspec or check_answers
         message = _describe_error(error, form_toml, form_values)
         raise SettingsError(f"{path}: {message}", "Correct the answer form.") from error
     return answers
@@ -298,22 +311,22 @@ def _describe_error(error: Exception, form_toml: str, form_values: dict[str, Any
         content = one_line(form_toml.splitlines()[int(line) - 1], 60)
         return f"line {line} ({content}) is not valid; give {NUMBER_HELP}, or a word in quotes"
     reason, _, path = message.partition(" - at `$.")
-    names = re.findall(r"\w+", path)  # for example "mistakes", "0" and "size"
+    names = re.findall(r"\w+", path)
     if not names:
         return message
     invalid_value: Any = form_values
     for name in names:
         invalid_value = invalid_value[int(name) if name.isdigit() else name]
     label = names[0]
-    if len(names) > 1:
-        number = int(names[1]) + 1
-        if isinstance(invalid_value, dict):
-            return f"mistake {number}: {reason}"
-        label = {
-            "mistakes": f"{names[-1]} of mistake {number}",
-            "quantities": f"q{number}",
-            "choices": f"c{number}",
-        }.get(label, label)
+    match names:
+        case ["mistakes", index]:
+            return f"mistake {int(index) + 1}: {reason}"
+        case ["mistakes", index, field]:
+            label = f"{field} of mistake {int(index) + 1}"
+        case ["quantities", index, *_]:
+            label = f"q{int(index) + 1}"
+        case ["choices", index]:
+            label = f"c{int(index) + 1}"
     accepted_values = ACCEPTED_ANSWER_BY_FIELD.get(names[0]) or ACCEPTED_ANSWER_BY_FIELD.get(
         names[-1], NUMBER_HELP
     )
@@ -330,18 +343,20 @@ def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
     )
     quantity_fields = [f"q{number}" for number in range(1, len(_QUESTION_KIND_PAIRS) + 1)]
     choice_fields = [f"c{number}" for number in range(1, MAX_CHOICES + 1)]
-    unknown_fields = quantities.keys() - quantity_fields | choices.keys() - choice_fields
-    if unknown_fields or "mistakes" in filled_form:
+    unknown_fields = (quantities.keys() - quantity_fields) | (choices.keys() - choice_fields)
+    if "mistakes" in filled_form:  # field of Answers; the name in the form is "mistake"
+        unknown_fields.add("mistakes")
+    if unknown_fields:
         raise ValueError(
-            f"the field {min(unknown_fields, default='mistakes')} is unknown; known fields: "
+            f"the field {min(unknown_fields)} is unknown; known fields: "
             f"mistake, {', '.join(quantity_fields)}"
         )
-    answered_choice_fields = choice_fields if choices else ()
+    # a form without answers about figures gives no choices instead of blank choices
     return {
         **filled_form,
         "mistakes": mistakes,
         "quantities": tuple(map(quantities.get, quantity_fields)),
-        "choices": tuple(choices.get(name, "") for name in answered_choice_fields),
+        "choices": tuple(choices.get(name, "") for name in choice_fields) if choices else (),
     }
 
 
@@ -381,7 +396,7 @@ def check_answers(answers: Answers) -> None:
         if size is not None and not fault_kind.min_size <= size <= fault_kind.max_size:
             raise ValueError(
                 f"{kind}: size {size:g} is out of range ({fault_kind.min_size:g} to "
-                f"{fault_kind.max_size:g} {next(iter(fault_kind.units))})"
+                f"{fault_kind.max_size:g} {fault_kind.standard_unit})"
             )
 
 

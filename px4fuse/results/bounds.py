@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
@@ -26,8 +27,12 @@ CHECK_LOG_REMEDY = "Check the logged data."
 T = TypeVar("T", bound=msgspec.Struct)
 
 
+@dataclass(eq=False)
 class _OutOfBoundsError(Exception):
     """Number in results outside its valid range."""
+
+    path: str
+    reason: str
 
 
 def find_bounds(name: str) -> tuple[float, float]:
@@ -52,17 +57,20 @@ def drop_invalid_numbers(results: T) -> T:
     ResultsError
         The results are not valid without the number.
     """
-    reasons: list[str] = []
+    errors: list[_OutOfBoundsError] = []
     try:
-        checked_results: T = _check_value(results, None, "", reasons)
+        checked_results: T = _check_value(results, None, "", errors)
     except _OutOfBoundsError as error:
-        raise ResultsError(f"a required result is not valid: {error}", CHECK_LOG_REMEDY) from error
+        raise ResultsError(
+            f"a required result is not valid: {error.reason}", CHECK_LOG_REMEDY
+        ) from error
     if hasattr(checked_results, "missing"):
         unavailable_numbers = (
-            Unavailable(reason.partition(" ")[0], reason, CHECK_LOG_REMEDY) for reason in reasons
+            Unavailable(error.path, error.reason, CHECK_LOG_REMEDY) for error in errors
         )
         return replace(checked_results, missing=(*checked_results.missing, *unavailable_numbers))
     if hasattr(checked_results, "notes"):
+        reasons = (error.reason for error in errors)
         return replace(checked_results, notes=(*checked_results.notes, *reasons))
     return checked_results
 
@@ -76,23 +84,33 @@ def list_types(annotation: Any) -> tuple[Any, ...]:
     return getattr(annotation, "union_members", (annotation,))
 
 
-def _check_value(value: Any, annotation: Any, path: str, reasons: list[str]) -> Any:
+def find_value_type(annotation: Any) -> Any:
+    """Return the type of the values of a mapping, such as float for ``Mapping[str, float]``."""
+    for member in list_types(annotation):
+        match get_args(member):
+            case [_, value_type]:
+                return value_type
+    return Any
+
+
+def _check_value(value: Any, annotation: Any, path: str, errors: list[_OutOfBoundsError]) -> Any:
     """Return the value without invalid numbers, or an Unavailable if ``annotation`` allows it."""
     try:
         if isinstance(value, msgspec.Struct):
-            return _check_struct(value, path, reasons)
+            return _check_struct(value, path, errors)
         if isinstance(value, Mapping):
-            return _check_mapping(value, annotation, path, reasons)
+            return _check_mapping(value, annotation, path, errors)
         if isinstance(value, tuple):
-            return _check_tuple(value, path, reasons)
+            return _check_tuple(value, path, errors)
         if isinstance(value, float):
             _require_valid_number(value, path)
     except _OutOfBoundsError as error:
         for unavailable_type in list_types(annotation):
             if isinstance(unavailable_type, type) and issubclass(unavailable_type, Unavailable):
-                text_fields = {"what": path, "reason": str(error), "remedy": CHECK_LOG_REMEDY}
+                text_fields = {"what": path, "reason": error.reason, "remedy": CHECK_LOG_REMEDY}
+                # for example the truth errors of a filter, if its NIS is not valid
                 other_fields = {
-                    field.name: _check_value(getattr(value, field.name), field.type, path, reasons)
+                    field.name: _check_value(getattr(value, field.name), field.type, path, errors)
                     for field in fields(unavailable_type)
                     if field.name not in text_fields and hasattr(value, field.name)
                 }
@@ -104,57 +122,62 @@ def _check_value(value: Any, annotation: Any, path: str, reasons: list[str]) -> 
 def _require_valid_number(value: float, path: str) -> None:
     low, high = find_bounds(path.rpartition(".")[2])
     if not math.isfinite(value):
-        raise _OutOfBoundsError(f"{path} has a value that is not finite")
+        raise _OutOfBoundsError(path, f"{path} has a value that is not finite")
     if not low <= value <= high:
-        raise _OutOfBoundsError(f"{path} is {value:.3g} (allowed: {low:g} to {high:g})")
+        raise _OutOfBoundsError(path, f"{path} is {value:.3g} (allowed: {low:g} to {high:g})")
 
 
-def _check_struct(value: msgspec.Struct, path: str, reasons: list[str]) -> msgspec.Struct:
+def _check_struct(
+    value: msgspec.Struct, path: str, errors: list[_OutOfBoundsError]
+) -> msgspec.Struct:
     changes: dict[str, Any] = {}
     for field in fields(value):
         if field.type is msgspec.UnsetType:
             continue
         field_value, field_path = getattr(value, field.name), f"{path}.{field.name}".lstrip(".")
         try:
-            changes[field.name] = _check_value(field_value, field.type, field_path, reasons)
+            changes[field.name] = _check_value(field_value, field.type, field_path, errors)
         except _OutOfBoundsError as error:
             if field.default is not None:
                 raise
-            reasons.append(str(error))
+            errors.append(error)
             changes[field.name] = None
     return type(value)(**changes)
 
 
-def _check_mapping(value: Mapping[str, Any], annotation: Any, path: str, reasons: list[str]) -> Any:
-    value_type = next(
-        (get_args(member)[1] for member in list_types(annotation) if len(get_args(member)) == 2),
-        Any,
-    )
+def _check_mapping(
+    value: Mapping[str, Any], annotation: Any, path: str, errors: list[_OutOfBoundsError]
+) -> Any:
     checked_elements: dict[str, Any] = {}
     for key, element in value.items():
         try:
-            checked_elements[key] = _check_value(element, value_type, f"{path}.{key}", reasons)
+            checked_elements[key] = _check_value(
+                element, find_value_type(annotation), f"{path}.{key}", errors
+            )
         except _OutOfBoundsError as error:
-            reasons.append(str(error))
+            errors.append(error)
+    # a mapping that must not be empty, such as the axes, is not valid as a whole
     if not checked_elements and any(
         getattr(meta, "min_length", 0) for meta in get_args(annotation)[1:]
     ):
-        raise _OutOfBoundsError(reasons[-1])
+        raise errors[-1]
     return checked_elements
 
 
-def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple[Any, ...]:
+def _check_tuple(
+    value: tuple[Any, ...], path: str, errors: list[_OutOfBoundsError]
+) -> tuple[Any, ...]:
     """Return the valid elements of a tuple.
 
-    An invalid record is omitted, and the reason is added to ``reasons``. An invalid number raises
+    An invalid record is omitted, and the error is added to ``errors``. An invalid number raises
     :class:`_OutOfBoundsError`, because the other numbers of the tuple have no meaning without it.
     """
     checked_elements = []
     for element in value:
         try:
-            checked_elements.append(_check_value(element, Any, path, reasons))
+            checked_elements.append(_check_value(element, Any, path, errors))
         except _OutOfBoundsError as error:
             if not isinstance(element, msgspec.Struct):
                 raise
-            reasons.append(str(error))
+            errors.append(error)
     return tuple(checked_elements)

@@ -10,7 +10,7 @@ from msgspec.structs import fields
 from px4fuse.core.record import decode_record_or_unavailable
 from px4fuse.core.text import clean_text, convert_nested, one_line
 from px4fuse.errors import ResultsError
-from px4fuse.results.bounds import list_types
+from px4fuse.results.bounds import find_value_type, list_types
 from px4fuse.results.contract import RESULTS_BY_SCHEMA, Results
 from px4fuse.results.model import SCHEMA_VERSION
 
@@ -69,13 +69,20 @@ def _remove_unknown_fields(value: Any, annotation: Any) -> Any:
     """Remove fields that are unknown to this version from decoded JSON."""
     types = list_types(annotation)
     if isinstance(value, dict):
-        record_types = [record for record in types if hasattr(record, "__struct_fields__")]
-        field_types = {field.encode_name: field.type for r in record_types for field in fields(r)}
-        value_type = next((args[1] for args in map(get_args, types) if len(args) == 2), Any)
+        # a union may contain several records, such as a result and Unavailable
+        record_types = [each for each in types if hasattr(each, "__struct_fields__")]
+        if not record_types:
+            value_type = find_value_type(annotation)
+            return {key: _remove_unknown_fields(child, value_type) for key, child in value.items()}
+        field_types = {
+            field.encode_name: field.type
+            for record_type in record_types
+            for field in fields(record_type)
+        }
         return {
-            key: _remove_unknown_fields(child, field_types.get(key, value_type))
+            key: _remove_unknown_fields(child, field_types[key])
             for key, child in value.items()
-            if key in field_types or not record_types
+            if key in field_types
         }
     if isinstance(value, list):
         item_type = next((args[0] for args in map(get_args, types) if args), Any)

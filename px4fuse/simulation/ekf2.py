@@ -157,29 +157,17 @@ def simulate_ekf2(
     logged_values = {name: float(np.float32(value)) for name, value in log_parameters.items()}
     step_s = float(np.median(segment.step_s))
     if other_sensors:
-        magnetometer_topic, barometer_topic = other_sensors
+        magnetometer, barometer = other_sensors
+        # EKF2 subtracts half a prediction step from sample times (estimator_interface.cpp)
         magnetometer_times_s, barometer_times_s = (
             sensors.to_seconds(sensors.get_time_us(topic)) - 0.5 * step_s for topic in other_sensors
         )
-        # the barometer is EKF2's only height source outdoors
-        down_m = sensors.HOME_POSITION[2] - barometer_topic.fields["baro_alt_meter"].astype(float)
-        barometer_samples = pd.DataFrame(
-            {"down_m": down_m, "dead_zone_m": 0.0, "weight": 1.0}, barometer_times_s
-        )
-        step_indices, is_inside = find_sample_steps(segment, barometer_times_s)
-        height_samples = HeightSamples(
-            (BAROMETER.name,),
-            BAROMETER.name,
-            np.zeros(2),
-            step_indices,
-            barometer_samples[is_inside],
-        )
-        segment = replace(segment, height_samples=height_samples)
-        if not logged_values[MAG.switch]:
+        segment = _add_barometer(segment, barometer, barometer_times_s)
+        if not logged_values[MAG.switch]:  # EKF2 fuses all axes of the magnetic field
             segment = add_field_states(
                 segment,
                 magnetometer_times_s,
-                magnetometer_topic.fields["magnetometer_ga"].astype(np.float64),
+                magnetometer.fields["magnetometer_ga"].astype(np.float64),
                 1.0,
                 # EKF2 initialises earth field and magnetometer bias on the ground
                 np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)]),
@@ -187,18 +175,19 @@ def simulate_ekf2(
             )
     settings = fill_with_defaults(logged_values, *_select_fused_aids(scenario))
     rules = GNSS_RULES if aid == GNSS_POS else VISION_RULES
+    if not int(log_parameters[aid.switch]) & 1:
+        # If bit 0 of EKF2_EV_CTRL is not set, EKF2 tests the positions but never fuses them
+        # (ev_pos_control.cpp). A start interval of 0 has this effect
+        rules = replace(rules, max_sample_interval_to_start_s=0.0)
+    # EKF2 delays the fusion by the length of its IMU buffer, in steps (estimator_interface.cpp)
+    buffer_length = int(np.ceil(1e3 * settings["EKF2_DELAY_MAX"] / PREDICTION_STEP_US))
     inputs = ReplayInputs(
         settings=settings,
         segments=(segment,),
         received_positions=_select_positions(source),
-        # If bit 0 of EKF2_EV_CTRL is not set, EKF2 tests the positions but never fuses them
-        # (ev_pos_control.cpp). A start interval of 0 has this effect
-        rules=rules
-        if int(log_parameters[aid.switch]) & 1
-        else replace(rules, max_sample_interval_to_start_s=0.0),
+        rules=rules,
         mean_step_s=step_s,
-        horizon_s=(int(np.ceil(settings["EKF2_DELAY_MAX"] * 1e3 / PREDICTION_STEP_US)) - 1)
-        * step_s,
+        horizon_s=(buffer_length - 1) * step_s,
         configured_step_s=PREDICTION_STEP_US * 1e-6,
         fuses_vision_height=False,
         imu_offset_m=np.zeros(3),
@@ -213,6 +202,20 @@ def simulate_ekf2(
         scenario.attitude_rate_hz,
         aid_source_log_rate_hz=VEHICLE_AID_SOURCE_LOG_RATE_HZ if faults.no_vvo else 0.0,
     )
+
+
+def _add_barometer(
+    segment: ReplaySegment, barometer: Topic, measurement_times_s: Array
+) -> ReplaySegment:
+    """Add the barometer samples, which are EKF2's only height source outdoors."""
+    down_m = sensors.HOME_POSITION[2] - barometer.fields["baro_alt_meter"].astype(float)
+    samples = pd.DataFrame(
+        {"down_m": down_m, "dead_zone_m": 0.0, "weight": 1.0}, measurement_times_s
+    )
+    step_indices, is_inside = find_sample_steps(segment, measurement_times_s)
+    name = BAROMETER.name
+    height_samples = HeightSamples((name,), name, np.zeros(2), step_indices, samples[is_inside])
+    return replace(segment, height_samples=height_samples)
 
 
 def _make_segment(
@@ -235,16 +238,19 @@ def _make_segment(
     integrated_attitude = cumulative_product(
         np.concatenate([true_quaternions[:1], from_rotation_vector(rotation_rad)])
     )
+    # rotation from the integrated gyro to the true attitude: the model integrates the gyro, and its
+    # attitude corrections keep it at the true attitude
     attitude_difference = multiply(true_quaternions, conjugate(integrated_attitude))
     attitude_error_rad = sensors.simulate_attitude_error(scenario, faults, time_s).as_rotvec()
-    attitude_error_rad[:, :HEADING] = 0.0
+    attitude_error_rad[:, :HEADING] = 0.0  # EKF2 estimates the tilt itself
+    # measured at time 0, where the vehicle still stands
     specific_force_m_s2, rate_rad_s = sensors.measure_imu(
         scenario,
         faults,
         motion,
         np.zeros(1),
         sensors.RandomStream.IMU_NOISE_AT_REST,
-        REST_BEFORE_LOG_S * scenario.imu_rate_hz,
+        samples_per_average=REST_BEFORE_LOG_S * scenario.imu_rate_hz,
     )
     state, covariance = _compute_state_at_rest(
         body_to_ned[0], specific_force_m_s2[0], rate_rad_s[0], attitude_error_rad[0, HEADING]
@@ -282,18 +288,20 @@ def _compute_state_at_rest(
 
     One Kalman update of PX4's initial covariance uses the known specific force, rate and velocity.
     """
+    # rows of H: specific force in NED, angular rate and velocity
     H = np.zeros((9, STATE_COUNT))
     H[0:3, THETA] = -skew(rotation @ specific_force_m_s2)
     H[0:3, ACCELEROMETER_BIAS] = -rotation
     H[3:6, GYRO_BIAS] = np.eye(3)
     H[6:9, VELOCITY] = np.eye(3)
+    # at rest, the true specific force is -gravity, and angular rate and velocity are zero
     z = np.concatenate([-GRAVITY_M_S2 - rotation @ specific_force_m_s2, rate_rad_s, np.zeros(3)])
     P = np.diag(INITIAL_STATE_SIGMA**2)
     x = np.zeros(STATE_COUNT)
     P[HEADING, HEADING], x[HEADING] = INDOOR_HEADING_SIGMA_RAD**2, heading_error_rad
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(MEASUREMENT_SIGMA_AT_REST**2))
     x += K @ (z - H @ x)
-    x[HEADING] = heading_error_rad
+    x[HEADING] = heading_error_rad  # the update at rest does not measure the heading
     P -= K @ H @ P
     return x, 0.5 * (P + P.T)
 
@@ -341,12 +349,14 @@ def _compute_output(inputs: ReplayInputs, model_run: SegmentRun) -> Ekf2Output:
     )
     reset_m = np.zeros((len(state), 3))
     reset_m[reset_steps, :2] = reset_sizes_m
-    # EKF2 corrects the newest IMU samples with the older gyro bias of the fusion horizon
+    # Attitude error (NED) of the output predictor, which integrates the newest gyro samples. It
+    # subtracts the older gyro bias of the fusion horizon
     gyro_bias_rad_s = rotate(segment.body_to_ned[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:])
     attitude_error_steps_rad = (
         -segment.attitude_correction_rad - gyro_bias_rad_s * segment.step_s[:, None]
     )
     gyro_attitude_error_rad = state[0, THETA] + cumulative_sums(attitude_error_steps_rad)
+    # the output predictor then follows the attitude of the fusion horizon, lag_steps later
     attitude_error_rad = gyro_attitude_error_rad + sum_attitude_corrections(
         state[:, THETA] - gyro_attitude_error_rad, lag_steps, inputs.mean_step_s, inputs.horizon_s
     )
@@ -388,6 +398,7 @@ def _hold_position_without_aiding(
     has_recent_position_aiding = (
         time_s - np.maximum.accumulate(time_of_aiding_s) <= NO_AID_TIMEOUT_S
     )
+    # 0 without aiding, so the maximum is the last step with aiding
     last_step_with_aiding = np.maximum.accumulate(
         np.arange(len(time_s)) * has_recent_position_aiding
     )
@@ -395,9 +406,11 @@ def _hold_position_without_aiding(
     state[~has_recent_position_aiding, VELOCITY.start : VELOCITY.start + 2] = 0.0
     reset_events = np.flatnonzero(model_run.reset[:, 0])
     reset_steps = events.end_step[reset_events]
+    steps_before_reset = reset_steps - 1
+    # a reset moves the estimated or the held position to the measured position
     reset_sizes_m = np.where(
-        has_recent_position_aiding[reset_steps - 1, None],
+        has_recent_position_aiding[steps_before_reset, None],
         model_run.innovation[reset_events, 0, HORIZONTAL_POSITION_COLUMNS],
-        state[reset_steps, HORIZONTAL_POSITION] - state[reset_steps - 1, HORIZONTAL_POSITION],
+        state[reset_steps, HORIZONTAL_POSITION] - state[steps_before_reset, HORIZONTAL_POSITION],
     )
     return reset_steps, reset_sizes_m, has_recent_position_aiding

@@ -10,6 +10,7 @@ from px4fuse.core.arrays import Array, Array32, BoolArray, IntArray
 from px4fuse.ekf2.filter_recursion import (
     HORIZONTAL_POSITION,
     HORIZONTAL_POSITION_COLUMNS,
+    VELOCITY_COLUMNS,
     SegmentRun,
 )
 from px4fuse.ekf2.inputs import ReplayInputs
@@ -145,6 +146,7 @@ def _make_states_topic(
     Its horizontal position is 0, because v1.16 stores latitude and longitude elsewhere.
     """
     end_step = model_run.events[0].end_step
+    # one message for each step with an event
     logged_indices = ekf2_output.find_logged_messages(
         np.diff(end_step, prepend=0) > 0, end_step, STATES_LOG_RATE_HZ
     )
@@ -154,12 +156,12 @@ def _make_states_topic(
     states[:, 4 : 4 + ekf2_output.states_at_fusion_horizon.shape[1]] = (
         ekf2_output.states_at_fusion_horizon[logged_steps]
     )
-    # v1.16 stores the horizontal position outside this vector, as latitude and longitude
     states[:, 7:9] = 0.0
     if model_inputs.aid == GNSS_POS:
         # with a global origin, v1.16 logs the altitude instead of the down position
         states[:, 9] -= HOME_POSITION[2]
     variances = np.zeros((len(logged_steps), 24), np.float32)
+    # the first row of the variances is before the first event
     variances[:, : model_run.variance.shape[2]] = model_run.variance[logged_indices + 1, 0]
     return make_topic(
         "estimator_states",
@@ -171,60 +173,62 @@ def _make_position_aid_topics(
     model_inputs: ReplayInputs, model_run: SegmentRun, ekf2_output: Ekf2Output, rate_hz: float
 ) -> tuple[Topic, ...]:
     """Make estimator_aid_src_* of the position source, with one message per usable position."""
-    events, received_positions = model_run.events[0], model_inputs.received_positions
-    velocity_m_s = received_positions.velocity_m_s
+    events, positions = model_run.events[0], model_inputs.received_positions
+    # an event may occur without a position, or with a position that EKF2 does not use
     logged_indices = ekf2_output.find_logged_messages(events.usable, events.end_step, rate_hz)
     logged_steps, sample_indices = events.end_step[logged_indices], events.sample[logged_indices]
     timestamps = ekf2_output.make_timestamps(logged_steps, events.time_s[logged_indices])
-    measured_m = received_positions.position_m[sample_indices, :2]
-    north, east = measured_m.T
-    innovation_arrays = (model_run.innovation, model_run.innovation_variance, model_run.noise)
+    is_fused = model_run.fused[logged_indices, 0]
+    measured_m = positions.position_m[sample_indices, :2]
     innovation, innovation_variance, noise_variance = (
-        values[logged_indices, 0, HORIZONTAL_POSITION_COLUMNS] for values in innovation_arrays
+        values[logged_indices, 0]
+        for values in (model_run.innovation, model_run.innovation_variance, model_run.noise)
     )
     # If EKF2 does not test a position against the innovation gate, it still logs an innovation:
     # measured minus estimated position
-    innovation, innovation_variance = np.where(
-        np.isnan(innovation[:, :1]),
-        (
-            measured_m - ekf2_output.states_at_fusion_horizon[logged_steps][:, POSITION][:, :2],
-            model_run.variance[logged_indices + 1, 0, HORIZONTAL_POSITION] + noise_variance,
-        ),
-        (innovation, innovation_variance),
-    )
-    is_used = model_run.fused[logged_indices, 0] | model_run.reset[logged_indices, 0]
+    estimated_m = ekf2_output.states_at_fusion_horizon[logged_steps][:, POSITION][:, :2]
+    # the first row of the variances is before the first event
+    estimate_variance = model_run.variance[logged_indices + 1, 0, HORIZONTAL_POSITION]
+    position_noise_variance = noise_variance[:, HORIZONTAL_POSITION_COLUMNS]
+    position_innovation = innovation[:, HORIZONTAL_POSITION_COLUMNS]
+    is_untested = np.isnan(position_innovation[:, :1])
+    is_used = is_fused | model_run.reset[logged_indices, 0]
     last_fused_us = np.maximum.accumulate(
         is_used * (FIRST_TIMESTAMP_US + ekf2_output.time_us[logged_steps])
     )
-    observation = north, east
-    if velocity_m_s is not None:
-        observation = unproject(north, east, HOME_POSITION[:2])
+    observation = measured_m
+    if positions.velocity_m_s is not None:
+        north_m, east_m = measured_m.T
+        observation = np.stack(unproject(north_m, east_m, HOME_POSITION[:2]), axis=1)
     position_topic = _make_aid_source_topic(
         model_inputs.aid,
         model_inputs.settings,
         timestamps | {"time_last_fuse": last_fused_us},
-        np.stack(observation, axis=1),
-        innovation,
-        innovation_variance,
-        noise_variance,
+        observation,
+        np.where(is_untested, measured_m - estimated_m, position_innovation),
+        np.where(
+            is_untested,
+            estimate_variance + position_noise_variance,
+            innovation_variance[:, HORIZONTAL_POSITION_COLUMNS],
+        ).astype(float),
+        position_noise_variance,
         model_run.rejected[logged_indices, 0],
-        model_run.fused[logged_indices, 0],
+        is_fused,
     )
-    if velocity_m_s is None:
+    if positions.velocity_m_s is None:
         return (position_topic,)
-    innovation, innovation_variance, noise_variance = (
-        values[logged_indices, 0, :3] for values in innovation_arrays
-    )
+    innovation = innovation[:, VELOCITY_COLUMNS]
+    innovation_variance = innovation_variance[:, VELOCITY_COLUMNS]
     squared_gate = model_inputs.settings[GNSS_VEL.gate] ** 2
     is_outside_gate = np.any(innovation**2 > squared_gate * innovation_variance, axis=1)
     return position_topic, _make_aid_source_topic(
         GNSS_VEL,
         model_inputs.settings,
         timestamps,
-        velocity_m_s[sample_indices],
+        positions.velocity_m_s[sample_indices],
         innovation,
         innovation_variance,
-        noise_variance,
+        noise_variance[:, VELOCITY_COLUMNS],
         is_outside_gate,
         ~is_outside_gate & np.isfinite(innovation).all(axis=1),
     )
@@ -237,10 +241,11 @@ def _make_barometer_topics(
     height_samples, end_step = model_run.segment.height_samples, model_run.events[0].end_step
     if height_samples is None or model_run.height_filter is None:
         return []
+    # with step numbers as event times, the column "fused_at_s" contains step numbers
     updates = model_run.height_filter.make_update_table(BAROMETER.name, 0, end_step.astype(float))
-    updates = updates[
-        updates["fused_at_s"] < len(ekf2_output.time_us) - ekf2_output.lag_steps
-    ].iloc[1:]
+    last_published_step = len(ekf2_output.time_us) - ekf2_output.lag_steps - 1
+    # EKF2 does not log the first sample, which only initialises the height
+    updates = updates[updates["fused_at_s"] <= last_published_step].iloc[1:]
     updates = updates[is_kept_at_rate(updates.index.to_numpy(), OTHER_AIDS_LOG_RATE_HZ)]
     innovation, innovation_variance, is_rejected, is_fused, step_by_update = updates.to_numpy().T
     measurement_times_s, steps = updates.index.to_numpy(), step_by_update.astype(np.intp)
@@ -271,22 +276,19 @@ def _make_magnetometer_topics(
     end_step = model_run.events[0].end_step
     if field is None:
         return []
-    has_sample = np.isfinite(model_run.magnetometer_updates[:, 2, 0, 0])
+    # magnetometer_updates contains, for each event, the rows innovation, innovation variance and
+    # fused fraction of the first configuration
+    updates = model_run.magnetometer_updates[:, :, 0]
+    has_sample = np.isfinite(updates[:, 2, 0])
     logged_indices = ekf2_output.find_logged_messages(has_sample, end_step, OTHER_AIDS_LOG_RATE_HZ)
     logged_steps = end_step[logged_indices]
-    innovation, innovation_variance, fused_fraction = np.moveaxis(
-        model_run.magnetometer_updates[logged_indices, :, 0], 1, 0
-    )
-    observed_gauss = field.value[
-        np.searchsorted(field.step_indices, logged_steps, side="right") - 1
-    ]
+    innovation, innovation_variance, fused_fraction = updates[logged_indices].swapaxes(0, 1)
     is_fused = fused_fraction[:, 0] > 0.0
-    logged_attitude_steps, logged_status_steps = (
-        np.flatnonzero(is_kept_at_rate(to_seconds(time_us), rate_hz))
-        for time_us, rate_hz in (
-            (ekf2_output.time_us, attitude_rate_hz),
-            (ekf2_output.time_us[: -ekf2_output.lag_steps], FLAGS_LOG_RATE_HZ),
-        )
+    sample_indices = np.searchsorted(field.step_indices, logged_steps, side="right") - 1
+    time_s = to_seconds(ekf2_output.time_us)
+    logged_attitude_steps = np.flatnonzero(is_kept_at_rate(time_s, attitude_rate_hz))
+    logged_status_steps = np.flatnonzero(
+        is_kept_at_rate(time_s[: -ekf2_output.lag_steps], FLAGS_LOG_RATE_HZ)
     )
     return [
         make_attitude_topic(
@@ -299,7 +301,7 @@ def _make_magnetometer_topics(
             MAG,
             settings,
             ekf2_output.make_timestamps(logged_steps),
-            observed_gauss,
+            field.value[sample_indices],
             innovation,
             innovation_variance,
             settings[MAG.noise] ** 2,
@@ -349,18 +351,21 @@ def _make_flags_topic(
     ]
     last_attempt_s = np.full(len(time_s), -np.inf)
     last_attempt_s[steps_with_fusion_attempt] = time_s[steps_with_fusion_attempt]
+    # the maximum of all earlier attempts is the last attempt
     time_since_attempt_s = time_s - np.maximum.accumulate(last_attempt_s)
     is_fusing = time_since_attempt_s < model_inputs.rules.stop_timeout_s
-    has_changed = np.diff(is_fusing.astype(int), prepend=0) != 0
+    has_changed = np.diff(is_fusing, prepend=False)
     is_logged = has_changed | is_kept_at_rate(time_s, FLAGS_LOG_RATE_HZ)
     logged_steps = np.flatnonzero(is_logged[: len(time_s) - ekf2_output.lag_steps])
-    is_gnss = model_inputs.aid == GNSS_POS
     is_fusing = is_fusing[logged_steps]
+    is_gnss = model_inputs.aid == GNSS_POS
+    has_field_states = model_run.segment.magnetic_field is not None
     fields = ekf2_output.make_timestamps(logged_steps) | {
         "control_status_changes": np.cumsum(has_changed)[logged_steps],
         "cs_gnss_pos": is_fusing & is_gnss,
         "cs_ev_pos": is_fusing & (not is_gnss),
-        "cs_mag_hdg" if model_run.segment.magnetic_field is None else "cs_mag_3d": True,
+        "cs_mag_3d" if has_field_states else "cs_mag_hdg": True,
     }
-    fields |= {"cs_gnss_vel": is_fusing} if is_gnss else {}
+    if is_gnss:
+        fields["cs_gnss_vel"] = is_fusing
     return make_topic("estimator_status_flags", fields)

@@ -1,5 +1,6 @@
 """Simulated flights as PX4 topics, ULog or Flight, and their answer keys."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -48,21 +49,7 @@ def simulate(scenario: Scenario, faults: FaultSizes = NO_FAULTS) -> Simulation:
     SettingsError
         An injected fault is not possible in this scenario.
     """
-    for name in injected_fault_names(faults):
-        if scenario.kind not in (kinds := FAULT_TYPES[name].kinds):
-            raise SettingsError(f"--mistake {name} requires --kind {' or '.join(kinds)}.")
-        if name.startswith("ekf2-") and not scenario.ekf2:
-            raise SettingsError(
-                f"--mistake {name} changes EKF2, which --no-ekf2 does not simulate. Omit --no-ekf2."
-            )
-    if scenario.aid == GNSS_POS and 0.0 < faults.ekf2_noise_m < (
-        reported_m := sensors.compute_reported_sigma_m(scenario, faults)
-    ):
-        raise SettingsError(
-            f"--mistake ekf2-noise={faults.ekf2_noise_m:g} has no effect outdoors: "
-            f"EKF2 uses the larger of {GNSS_POS.noise} and the accuracy that the receiver reports "
-            f"({reported_m:g} m). Use a larger value."
-        )
+    _require_possible_faults(scenario, faults)
     motion = plan_flight(
         scenario,
         faults,
@@ -81,8 +68,9 @@ def simulate(scenario: Scenario, faults: FaultSizes = NO_FAULTS) -> Simulation:
     other_sensors: tuple[Topic, ...] = ()
     if scenario.aid == GNSS_POS:
         barometer = sensors.simulate_barometer(scenario, motion)
-        other_sensors = (sensors.simulate_magnetometer(scenario, faults, motion), barometer)
-        topics += [sensors.limit_rate(other_sensors[0], MAGNETOMETER_LOG_RATE_HZ), barometer]
+        magnetometer = sensors.simulate_magnetometer(scenario, faults, motion)
+        other_sensors = magnetometer, barometer
+        topics += [sensors.limit_rate(magnetometer, MAGNETOMETER_LOG_RATE_HZ), barometer]
     if scenario.truth:
         topics.append(sensors.simulate_ground_truth(scenario, motion))
     for topic in topics:
@@ -95,11 +83,29 @@ def simulate(scenario: Scenario, faults: FaultSizes = NO_FAULTS) -> Simulation:
         ekf2_topics = ekf2.simulate_ekf2(
             scenario, faults, motion, imu, positions, other_sensors, parameters
         )
+        # outdoors, EKF2 also computes vehicle_attitude: it replaces the simulated topic
         ekf2_topic_names = {topic.name for topic in ekf2_topics}
         topics = [*(topic for topic in topics if topic.name not in ekf2_topic_names), *ekf2_topics]
     if scenario.truth:
         topics.append(sensors.simulate_true_attitude(scenario, motion))
     return Simulation(scenario, faults, motion, positions, tuple(topics), parameters)
+
+
+def _require_possible_faults(scenario: Scenario, faults: FaultSizes) -> None:
+    for name in injected_fault_names(faults):
+        if scenario.kind not in (kinds := FAULT_TYPES[name].kinds):
+            raise SettingsError(f"--mistake {name} requires --kind {' or '.join(kinds)}.")
+        if name.startswith("ekf2-") and not scenario.ekf2:
+            raise SettingsError(
+                f"--mistake {name} changes EKF2, which --no-ekf2 does not simulate. Omit --no-ekf2."
+            )
+    reported_sigma_m = sensors.compute_reported_sigma_m(scenario, faults)
+    if scenario.aid == GNSS_POS and 0.0 < faults.ekf2_noise_m < reported_sigma_m:
+        raise SettingsError(
+            f"--mistake ekf2-noise={faults.ekf2_noise_m:g} has no effect outdoors: "
+            f"EKF2 uses the larger of {GNSS_POS.noise} and the accuracy that the receiver reports "
+            f"({reported_sigma_m:g} m). Use a larger value."
+        )
 
 
 def simulate_flight(scenario: Scenario, faults: FaultSizes = NO_FAULTS) -> Flight:
@@ -130,45 +136,47 @@ def to_flight(simulation: Simulation, name: str = "simulation.ulg") -> Flight:
 
 def make_answer_key(simulation: Simulation) -> dict[str, Any]:
     """Return injected faults and true values of a flight for the instructor, as JSON types."""
+    faults = simulation.faults
+    injected_faults = {}
+    for name in injected_fault_names(faults):
+        fault_type = FAULT_TYPES[name]
+        injected_faults[name] = {
+            "typed": format_fault(name, faults),
+            "help": fault_type.help,
+            "finding": fault_type.finding,
+            **{field: getattr(faults, field) for field in fault_type.value_field_names},
+        }
+    answer_key: dict[str, Any] = to_json_types(
+        {
+            "schema": ANSWER_SCHEMA,
+            "scenario": simulation.scenario,
+            "mistakes": injected_faults,
+            "truth": compute_true_values(simulation),
+        }
+    )
+    return answer_key
+
+
+def compute_true_values(simulation: Simulation) -> dict[str, float | list[float]]:
+    """Return the quantities of a simulated flight that its log does not contain."""
     scenario, faults = simulation.scenario, simulation.faults
     motion, source = simulation.motion, simulation.positions
     accelerometer_bias_m_s2, gyro_bias_rad_s = sensors.draw_imu_biases(scenario, faults)
     first_position_m, last_position_m = motion.compute_true_state(
         np.array([0.0, motion.duration_s])
     ).position_m
-    timestamps_us = sensors.get_time_us(source.topic, "timestamp_sample")
-    outlier_indices = np.flatnonzero(source.is_outlier)
-    answer_key: dict[str, Any] = to_json_types(
-        {
-            "schema": ANSWER_SCHEMA,
-            "scenario": scenario,
-            "mistakes": {
-                name: {
-                    "typed": format_fault(name, faults),
-                    "help": FAULT_TYPES[name].help,
-                    "finding": FAULT_TYPES[name].finding,
-                    **{
-                        field: getattr(faults, field)
-                        for field in FAULT_TYPES[name].value_field_names
-                    },
-                }
-                for name in injected_fault_names(faults)
-            },
-            "truth": {
-                "duration_s": motion.duration_s,
-                "airborne_s": [motion.take_off_s, motion.touch_down_s],
-                "sigma_z_m": scenario.source_sigma_m,
-                "sigma_a_m_s2": float(np.hypot(scenario.sigma_a_m_s2, faults.vibration_m_s2)),
-                "reported_sigma_m": sensors.compute_reported_sigma_m(scenario, faults),
-                "accelerometer_bias_m_s2": accelerometer_bias_m_s2.tolist(),
-                "gyro_bias_rad_s": gyro_bias_rad_s.tolist(),
-                "clock_offset_to_add_s": 0.0 - faults.clock_offset_s,
-                "outlier_index": outlier_indices.tolist(),
-                "outlier_time_s": (timestamps_us[outlier_indices] * 1e-6).tolist(),
-                "path_length_m": source.distance_m,
-                "closure_error_m": float(np.linalg.norm((last_position_m - first_position_m)[:2])),
-                "source_drift_m": source.drift_m.tolist(),
-            },
-        }
-    )
-    return answer_key
+    return {
+        "duration_s": motion.duration_s,
+        "airborne_s": [motion.take_off_s, motion.touch_down_s],
+        "sigma_z_m": scenario.source_sigma_m,
+        "sigma_a_m_s2": math.hypot(scenario.sigma_a_m_s2, faults.vibration_m_s2),
+        "reported_sigma_m": sensors.compute_reported_sigma_m(scenario, faults),
+        "accelerometer_bias_m_s2": accelerometer_bias_m_s2.tolist(),
+        "gyro_bias_rad_s": gyro_bias_rad_s.tolist(),
+        "clock_offset_to_add_s": 0.0 - faults.clock_offset_s,  # 0.0, not -0.0, without a fault
+        "outlier_index": np.flatnonzero(source.is_outlier).tolist(),
+        "outlier_time_s": source.outlier_times_s.tolist(),
+        "path_length_m": source.distance_m,
+        "closure_error_m": float(np.linalg.norm((last_position_m - first_position_m)[:2])),
+        "source_drift_m": source.drift_m.tolist(),
+    }

@@ -181,15 +181,16 @@ def compute_attitude(state: TrueState) -> AttitudeAndImu:
     specific_thrust_m_s2 = np.sqrt(
         _dot(negative_thrust_acceleration_m_s2, negative_thrust_acceleration_m_s2)
     )[:, None]
+    # the thrust is along -z; the derivative of the unit vector z is perpendicular to z
     z = negative_thrust_acceleration_m_s2 / specific_thrust_m_s2
     z_derivative_per_s = -state.jerk_m_s3 / specific_thrust_m_s2
     z_derivative_per_s -= z * _dot(z, z_derivative_per_s)[:, None]
-    yaw_rad = state.yaw_rad
     forward_direction, right_direction = (
         np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
-        for angle in (yaw_rad, yaw_rad + np.pi / 2.0)
+        for angle in (state.yaw_rad, state.yaw_rad + np.pi / 2.0)
     )
-    # direction of the body's y axis, not normalised: z × forward direction
+    # direction of the body's y axis, not normalised: z × forward direction. The forward direction
+    # turns to the right with the yaw rate
     unnormalised_y = np.cross(z, forward_direction)
     unnormalised_y_derivative_per_s = np.cross(
         z_derivative_per_s, forward_direction
@@ -197,7 +198,8 @@ def compute_attitude(state: TrueState) -> AttitudeAndImu:
     unnormalised_y_length = np.sqrt(_dot(unnormalised_y, unnormalised_y))
     y = unnormalised_y / unnormalised_y_length[:, None]
     x = np.cross(y, z)
-    # angular rate ω in body axes, from dR/dt = R [ω]×
+    # Angular rate ω in body axes. A body axis e moves with de/dt = ω × e, so ω_x = -y · dz/dt,
+    # ω_y = x · dz/dt and ω_z = -x · dy/dt
     rate_rad_s = np.stack(
         [
             -_dot(z_derivative_per_s, y),
@@ -227,10 +229,13 @@ def plan_flight(scenario: Scenario, faults: FaultSizes, rng: np.random.Generator
     climb_rate_m_s = min(MAX_CLIMB_RATE_M_S, scenario.altitude_m / 2.0)
     climb_time_s = scenario.altitude_m / climb_rate_m_s
     climb_velocity_m_s = np.array([0.0, 0.0, -climb_rate_m_s])
+    # between the centres of its two ramps, the vehicle moves with the full velocity on average
     flight_plan.add_velocity_change(climb_velocity_m_s, CLIMB_RAMP_DURATION_S, climb_time_s)
+    # the horizontal flight begins after half a ramp and a pause
     flight_plan.add_velocity_change(
         -climb_velocity_m_s, CLIMB_RAMP_DURATION_S, CLIMB_RAMP_DURATION_S / 2.0 + scenario.pause_s
     )
+    # without motion, the vehicle hovers for the same time
     speed_m_s = 0.0 if faults.no_motion else scenario.speed_m_s
     if scenario.kind == "aisle":
         _plan_aisle_passes(flight_plan, scenario, speed_m_s)
@@ -285,10 +290,12 @@ def compute_direction(heading_deg: float) -> Array:
 def _plan_aisle_passes(flight_plan: _FlightBuilder, scenario: Scenario, speed_m_s: float) -> None:
     velocity_m_s = speed_m_s * compute_direction(scenario.heading_deg)
     heading_follows_path = scenario.nose_follows_path and speed_m_s > 0.0
-    pause_s = max(scenario.pause_s, TURN_ROUND_DURATION_S * heading_follows_path)
+    pause_s = max(scenario.pause_s, TURN_ROUND_DURATION_S if heading_follows_path else 0.0)
+    # the first ramp starts now, so its centre is later
     flight_plan.ramp_centre_s += SPEED_RAMP_DURATION_S / 2.0
     for pass_index in range(scenario.passes):
         pass_velocity_m_s = velocity_m_s if pass_index % 2 == 0 else -velocity_m_s
+        # the speed of the scenario also sets the time of a flight without motion
         flight_plan.add_velocity_change(
             pass_velocity_m_s, SPEED_RAMP_DURATION_S, scenario.length_m / scenario.speed_m_s
         )
@@ -310,6 +317,7 @@ def _plan_square_laps(
         )
     side_count = 4 * scenario.passes
     previous_velocity_m_s = np.zeros(3)
+    # the first ramp starts now, so its centre is later
     flight_plan.ramp_centre_s += SPEED_RAMP_DURATION_S / 2.0
     for side_index in range(side_count):
         velocity_m_s = speed_m_s * compute_direction(scenario.heading_deg + 90.0 * side_index)
@@ -317,7 +325,9 @@ def _plan_square_laps(
         if side_index and scenario.nose_follows_path and speed_m_s > 0.0:
             turn_start_s = flight_plan.ramp_centre_s - CORNER_DURATION_S / 2.0
             flight_plan.yaw_ramps.append((turn_start_s, CORNER_DURATION_S, np.array([np.pi / 2.0])))
-        side_length_m = scenario.length_m - open_end_m * (side_index == side_count - 1)
+        is_last_side = side_index == side_count - 1
+        side_length_m = scenario.length_m - (open_end_m if is_last_side else 0.0)
+        # the speed of the scenario also sets the time of a flight without motion
         flight_plan.add_velocity_change(
             velocity_m_s - previous_velocity_m_s,
             ramp_duration_s,

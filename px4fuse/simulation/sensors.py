@@ -1,5 +1,6 @@
 """Simulated sensor topics as PX4 v1.16 logs them, with the injected faults of the flight."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
@@ -98,6 +99,11 @@ class SimulatedPositions:
     measurement_times_s: Array
     distance_m: float
     drift_m: Array
+
+    @property
+    def outlier_times_s(self) -> Array:
+        """Timestamps (s from the first sample) of the outliers."""
+        return to_seconds(get_time_us(self.topic, "timestamp_sample")[self.is_outlier])
 
 
 def draw_imu_biases(scenario: Scenario, faults: FaultSizes) -> tuple[Array, Array]:
@@ -297,42 +303,28 @@ def simulate_positions(
     )
     time_s = np.maximum(nominal_times_s + jitter_fraction * interval_s, 0.0)
     state = motion.compute_true_state(time_s)
-    position_m = state.position_m.copy()
     speed_m_s = np.hypot(state.velocity_m_s[:, 0], state.velocity_m_s[:, 1])
     distance_m = integrate_cumulatively(speed_m_s, time_s)
     is_loop, is_outdoor = scenario.kind == "loop", scenario.kind == "outdoor"
     drift_m = simulate_vio_drift(scenario, distance_m) * is_loop
-    position_m += drift_m
     sigma_m = scenario.source_sigma_m * (GNSS_SIGMA_FACTORS if is_outdoor else 1.0)
-    position_m += sigma_m * make_random_generator(
+    noise_m = sigma_m * make_random_generator(
         scenario, RandomStream.POSITION_NOISE
-    ).standard_normal(position_m.shape)
+    ).standard_normal(drift_m.shape)
     is_airborne = (time_s > motion.take_off_s) & (time_s < motion.touch_down_s)
     outlier_offset_m, is_outlier = simulate_outliers(scenario, faults, is_airborne)
-    position_m += outlier_offset_m
+    position_m = state.position_m + drift_m + noise_m + outlier_offset_m
     position_m += simulate_correlated_noise(scenario, faults, len(time_s), interval_s)
-    if faults.smoothed_s:
-        decay_factor = np.exp(-interval_s / faults.smoothed_s)
-        position_m, _ = lfilter(
-            [1.0 - decay_factor],
-            [1.0, -decay_factor],
-            position_m,
-            axis=0,
-            zi=decay_factor * position_m[:1],
-        )
-    position_m *= 1.0 + faults.scale_percent / 100.0
-    if faults.yaw_deg:
-        position_m = Rotation.from_euler("z", faults.yaw_deg, degrees=True).apply(position_m)
-    jump_start_s = motion.duration_s / 1.5 if faults.jump_at_s is None else faults.jump_at_s
-    position_m[time_s >= jump_start_s] += faults.jump_m * compute_direction(scenario.heading_deg)
+    position_m = _apply_source_faults(position_m, time_s, scenario, faults, motion)
     is_logged = _is_outside_gap(
         time_s, faults.dropout_s, faults.dropout_at_s, motion.duration_s
     ) & is_kept_at_rate(time_s, faults.decimate_hz)
-    arrival_times_us, timestamp_us = _simulate_position_times_us(faults, time_s, timing_rng)
+    position_m = position_m[is_logged]
+    arrival_times_us, timestamp_us = (
+        times_us[is_logged] for times_us in _simulate_position_times_us(faults, time_s, timing_rng)
+    )
     reported_sigma_m = compute_reported_sigma_m(scenario, faults)
     velocity_m_s = None
-    position_m = position_m[is_logged]
-    arrival_times_us, timestamp_us = arrival_times_us[is_logged], timestamp_us[is_logged]
     if is_outdoor:
         rng = make_random_generator(scenario, RandomStream.GNSS_VELOCITY_NOISE)
         velocity_sigma_m_s = scenario.sigma_gnss_m_s * GNSS_SIGMA_FACTORS
@@ -368,6 +360,28 @@ def simulate_positions(
         distance_m=float(distance_m[-1]),
         drift_m=drift_m[-1],
     )
+
+
+def _apply_source_faults(
+    position_m: Array, time_s: Array, scenario: Scenario, faults: FaultSizes, motion: Motion
+) -> Array:
+    """Apply the faults of the source in their order: low-pass filter, scale, yaw, and jump."""
+    if faults.smoothed_s:
+        decay_factor = np.exp(-1.0 / scenario.source_rate_hz / faults.smoothed_s)
+        # with this initial state, the filter starts at the first position
+        position_m, _ = lfilter(
+            [1.0 - decay_factor],
+            [1.0, -decay_factor],
+            position_m,
+            axis=0,
+            zi=decay_factor * position_m[:1],
+        )
+    position_m *= 1.0 + faults.scale_percent / 100.0
+    if faults.yaw_deg:
+        position_m = Rotation.from_euler("z", faults.yaw_deg, degrees=True).apply(position_m)
+    jump_start_s = motion.duration_s / 1.5 if faults.jump_at_s is None else faults.jump_at_s
+    position_m[time_s >= jump_start_s] += faults.jump_m * compute_direction(scenario.heading_deg)
+    return position_m
 
 
 def compute_reported_sigma_m(scenario: Scenario, faults: FaultSizes) -> float:
@@ -412,24 +426,22 @@ def simulate_outliers(
     if outlier_count == 0:
         return outlier_error_m, is_outlier
     rng = make_random_generator(scenario, RandomStream.NLOS_OUTLIERS)
-    burst_count = -(-outlier_count // MEAN_OUTLIER_BURST_POSITION_COUNT)
-    burst_lengths = 1 + rng.multinomial(
+    burst_count = math.ceil(outlier_count / MEAN_OUTLIER_BURST_POSITION_COUNT)
+    # lengths of good positions, burst, good positions, ..., burst, good positions; a burst has at
+    # least one outlier
+    run_lengths = np.empty(2 * burst_count + 1, np.intp)
+    run_lengths[1::2] = 1 + rng.multinomial(
         outlier_count - burst_count, np.full(burst_count, 1.0 / burst_count)
     )
-    good_position_counts_between_bursts = rng.multinomial(
+    run_lengths[::2] = rng.multinomial(
         len(airborne_indices) - outlier_count, np.full(burst_count + 1, 1.0 / (burst_count + 1))
     )
-    burst_index_by_outlier = np.repeat(np.arange(burst_count), burst_lengths)
-    # Index of an outlier: number of outliers and good positions before it
-    outlier_indices = airborne_indices[
-        np.arange(outlier_count)
-        + np.cumsum(good_position_counts_between_bursts)[burst_index_by_outlier]
-    ]
-    angle_rad = rng.uniform(0.0, 2.0 * np.pi, burst_count)[burst_index_by_outlier]
+    is_burst = np.arange(len(run_lengths)) % 2 == 1
+    is_outlier[airborne_indices] = np.repeat(is_burst, run_lengths)
+    angle_rad = np.repeat(rng.uniform(0.0, 2.0 * np.pi, burst_count), run_lengths[1::2])
     size_m = faults.nlos_size_m * rng.uniform(0.5, 1.5, outlier_count)
-    outlier_error_m[outlier_indices, 0] = size_m * np.cos(angle_rad)
-    outlier_error_m[outlier_indices, 1] = size_m * np.sin(angle_rad)
-    is_outlier[outlier_indices] = True
+    outlier_error_m[is_outlier, 0] = size_m * np.cos(angle_rad)
+    outlier_error_m[is_outlier, 1] = size_m * np.sin(angle_rad)
     return outlier_error_m, is_outlier
 
 
@@ -445,6 +457,8 @@ def _simulate_position_times_us(
     faults: FaultSizes, time_s: Array, rng: np.random.Generator
 ) -> tuple[IntArray, IntArray]:
     """Return arrival time and timestamp of each position, both in µs from the first sample."""
+    # Before TIMESYNC converges, PX4 uses the arrival time as timestamp. The timestamps jump by the
+    # latency when it converges, so a long latency simulates a clock jump
     mean_latency_s = faults.clock_jump_s or POSITION_LATENCY_S
     latency_s = np.maximum(
         rng.normal(mean_latency_s, POSITION_LATENCY_SIGMA_S, len(time_s)), MIN_POSITION_LATENCY_S

@@ -38,30 +38,27 @@ def make_topic(name: str, field_values: Mapping[str, ArrayLike]) -> Topic:
 
     A scalar value is used for all messages.
     """
+    # all topics of aiding sources have the same fields, except those that topics.toml lists
     fields_text = FIELD_DEFINITIONS_BY_TOPIC.get(
         name, FIELD_DEFINITIONS_BY_TOPIC["estimator_aid_src"]
     )
-    known_fields = {
-        field: type_and_default
-        for line in ["uint64: timestamp timestamp_sample", *fields_text.splitlines()]
-        for type_and_default, names in [line.split(":")]
-        for field in names.split()
-    }
-    unknown_fields = field_values.keys() - known_fields.keys()
-    assert not unknown_fields, f"{name} has no {unknown_fields}"
     message_count, fields = np.size(field_values["timestamp"]), {}
-    for field, type_and_default in known_fields.items():
+    for line in ["uint64: timestamp timestamp_sample", *fields_text.splitlines()]:
+        type_and_default, field_names = line.split(":")
+        # for example "float32 nan 4": type, default value, and number of elements of an array
         numpy_type, *default_and_shape = type_and_default.split()
-        if field in field_values:
-            values = np.asarray(field_values[field])
-            values = values if values.ndim else np.full(message_count, values)
-        elif default_and_shape:
-            values = np.full(
-                [message_count, *map(int, default_and_shape[1:])], float(default_and_shape[0])
-            )
-        else:
-            continue
-        fields[field] = values.astype(numpy_type)
+        for field in field_names.split():
+            if field in field_values:
+                values = np.asarray(field_values[field])
+                values = values if values.ndim else np.full(message_count, values)
+            elif default_and_shape:
+                default, *shape = default_and_shape
+                values = np.full([message_count, *map(int, shape)], float(default))
+            else:
+                continue
+            fields[field] = values.astype(numpy_type)
+    unknown_fields = field_values.keys() - fields.keys()
+    assert not unknown_fields, f"{name} has no {unknown_fields}"
     return Topic(name, fields)
 
 

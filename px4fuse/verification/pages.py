@@ -8,7 +8,7 @@ All objects of both files are compared pairwise. Two kinds of differences are to
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import islice, zip_longest
 from typing import Any
@@ -87,8 +87,9 @@ Operand = float | bytes | str
 Operation = tuple[str, tuple[Operand, ...]]
 # Value in the submitted PDF, value in the redrawn PDF (generated again by px4fuse), and their key
 _ValuePair = tuple[Any, Any, str]
-# Description of a difference, and True for added or missing PDF objects
+# Description of a difference, and True (_STRUCTURAL) for added or missing PDF objects
 _Difference = tuple[str, bool]
+_STRUCTURAL, _CONTENT = True, False
 
 
 def compare_pages(
@@ -144,7 +145,9 @@ class _PdfComparison:
     # pairs of objects that are already compared: number and generation in the submitted PDF, and
     # number in the redrawn PDF
     compared_objects: set[tuple[int, int, int]] = field(default_factory=set)
-    # pairs of values, with their key, that are compared after all pages
+    # nested values of the current page or entry that are not yet compared
+    pairs_to_compare: list[_ValuePair] = field(default_factory=list)
+    # pairs that are compared after all pages
     deferred_pairs: list[_ValuePair] = field(default_factory=list)
     # fonts of the current page by name
     fonts: Mapping[str, Any] = field(default_factory=dict)
@@ -156,10 +159,11 @@ class _PdfComparison:
     ) -> Iterator[PageDifference]:
         """Yield the differences of pages, document information and catalogue."""
         pages = [_get_page_references(reader) for reader in (submitted_pdf, redrawn_pdf)]
-        for key in ("/Info", "/Root"):
-            self.deferred_pairs.append(
-                (dict.get(submitted_pdf.trailer, key), dict.get(redrawn_pdf.trailer, key), key)
-            )
+        # document information and catalogue; dict.get does not resolve the references
+        self.deferred_pairs = [
+            (dict.get(submitted_pdf.trailer, key), dict.get(redrawn_pdf.trailer, key), key)
+            for key in ("/Info", "/Root")
+        ]
         for page_number, (submitted_page, redrawn_page) in enumerate(zip_longest(*pages), start=1):
             if submitted_page is None or redrawn_page is None:
                 page_counts = f"{len(pages[0])} pages; the recomputed report has {len(pages[1])}"
@@ -173,20 +177,20 @@ class _PdfComparison:
                 yield PageDifference(0, *difference)
         # programs for PDF 1.4 ignore /XRefStm, and could display other pages
         if "/XRefStm" in submitted_pdf.trailer:
-            yield PageDifference(0, SECOND_XREF_TABLE_REASON, True)
+            yield PageDifference(0, SECOND_XREF_TABLE_REASON, _STRUCTURAL)
 
     def _compare(self, pair: _ValuePair) -> Iterator[_Difference]:
         """Yield the differences of two PDF values, including nested values."""
-        pairs_to_compare = [pair]
-        while pairs_to_compare:
-            submitted_value, redrawn_value, key = pairs_to_compare.pop()
+        self.pairs_to_compare = [pair]
+        while self.pairs_to_compare:
+            submitted_value, redrawn_value, key = self.pairs_to_compare.pop()
             self.value_count += 1
             if self.value_count > MAX_PDF_VALUES:
                 raise LimitReachedError(f"the PDF contains more than {MAX_PDF_VALUES} values")
             if isinstance(submitted_value, IndirectObject):
                 if submitted_value.generation:
                     # programs that ignore generation numbers would display another object
-                    yield f"another program changed the PDF entry {key}", True
+                    yield f"another program changed the PDF entry {key}", _STRUCTURAL
                 if isinstance(redrawn_value, IndirectObject):
                     object_ids = (
                         submitted_value.idnum,
@@ -196,42 +200,39 @@ class _PdfComparison:
                     if object_ids in self.compared_objects:
                         continue
                     self.compared_objects.add(object_ids)
-            submitted_value, redrawn_value = map(
-                resolve_reference, (submitted_value, redrawn_value)
-            )
+            submitted_value = resolve_reference(submitted_value)
+            redrawn_value = resolve_reference(redrawn_value)
             if _pdf_type_of(submitted_value) is not _pdf_type_of(redrawn_value):
-                yield f"the PDF entry {key} has a wrong type", True
+                yield f"the PDF entry {key} has a wrong type", _STRUCTURAL
             elif isinstance(redrawn_value, DictionaryObject):
-                yield from self._compare_dictionaries(
-                    submitted_value, redrawn_value, key, pairs_to_compare
-                )
+                yield from self._compare_dictionaries(submitted_value, redrawn_value, key)
             elif isinstance(redrawn_value, ArrayObject):
                 if len(submitted_value) != len(redrawn_value):
                     yield (
                         f"the PDF array {key} has {len(submitted_value)} elements, not "
                         f"{len(redrawn_value)}",
-                        True,
+                        _STRUCTURAL,
                     )
                     continue
-                pairs = zip(*map(list.__iter__, (submitted_value, redrawn_value)), strict=True)
-                pairs_to_compare += [(*pair, key) for pair in pairs][::-1]
+                # list.__iter__ does not resolve the references
+                elements = zip(*map(list.__iter__, (submitted_value, redrawn_value)), strict=True)
+                # the last pair of the list is compared first
+                self.pairs_to_compare += reversed([(*pair, key) for pair in elements])
             elif not self._is_same_value(submitted_value, redrawn_value):
-                texts = [one_line(str(value), 60) for value in (submitted_value, redrawn_value)]
+                submitted_text = one_line(str(submitted_value), 60)
+                redrawn_text = one_line(str(redrawn_value), 60)
                 yield (
-                    f"the PDF entry {key} was changed to {texts[0]!r}; px4fuse wrote {texts[1]!r}",
-                    False,
+                    f"the PDF entry {key} was changed to {submitted_text!r}; px4fuse wrote "
+                    f"{redrawn_text!r}",
+                    _CONTENT,
                 )
 
     def _compare_dictionaries(
-        self,
-        submitted_dictionary: Any,
-        redrawn_dictionary: DictionaryObject,
-        key: str,
-        pairs_to_compare: list[_ValuePair],
+        self, submitted_dictionary: Any, redrawn_dictionary: DictionaryObject, key: str
     ) -> Iterator[_Difference]:
         """Yield the differences in keys and streams of two PDF dictionaries.
 
-        Add the pairs of their values to ``pairs_to_compare``.
+        Add the pairs of their values to ``pairs_to_compare`` or ``deferred_pairs``.
         """
         submitted_keys = _select_compared_keys(submitted_dictionary, key)
         redrawn_keys = _select_compared_keys(redrawn_dictionary, key)
@@ -239,13 +240,14 @@ class _PdfComparison:
             if name in submitted_keys:
                 yield (
                     f"the PDF contains an entry {one_line(name, 40)}, which px4fuse does not write",
-                    True,
+                    _STRUCTURAL,
                 )
             else:
-                yield f"the PDF lacks an entry {one_line(name, 40)}", True
+                yield f"the PDF lacks an entry {one_line(name, 40)}", _STRUCTURAL
+        # the last pair of the list is compared first
         for name in sorted(submitted_keys & redrawn_keys, reverse=True):
             # /Parent of a page refers to all other pages, so it is compared after all pages
-            (self.deferred_pairs if name == "/Parent" else pairs_to_compare).append(
+            (self.deferred_pairs if name == "/Parent" else self.pairs_to_compare).append(
                 (submitted_dictionary.raw_get(name), redrawn_dictionary.raw_get(name), name)
             )
         if isinstance(redrawn_dictionary, StreamObject):
@@ -275,7 +277,7 @@ class _PdfComparison:
             return
         filters = resolve_reference(submitted_stream.get("/Filter"))
         if filters not in (None, "/FlateDecode", ["/FlateDecode"]):  # pypdf does not decode JPEG
-            yield f"the compression of the PDF entry {key} is not supported", True
+            yield f"the compression of the PDF entry {key} is not supported", _STRUCTURAL
             return
         submitted_data, redrawn_data = submitted_stream.get_data(), redrawn_stream.get_data()
         if submitted_data == redrawn_data or (
@@ -287,9 +289,9 @@ class _PdfComparison:
         if not is_page_content or len(submitted_data) > MAX_SIZE_RATIO_TO_REDRAWN_PAGE * len(
             redrawn_data
         ):
-            yield f"the content of the PDF entry {key} was changed", False
+            yield f"the content of the PDF entry {key} was changed", _CONTENT
         elif description := self._describe_operation_difference(submitted_data, redrawn_data):
-            yield description, False
+            yield description, _CONTENT
 
     def _describe_operation_difference(
         self, submitted_content: bytes, redrawn_content: bytes
@@ -297,29 +299,32 @@ class _PdfComparison:
         """Describe the first drawing operation that differs; "" if all are equal."""
         operation_lists = map(_parse_drawing_operations, (submitted_content, redrawn_content))
         font_name = ""
-        for number, operations in enumerate(
+        for number, (submitted, redrawn) in enumerate(
             zip_longest(*operation_lists, fillvalue=("", ())), start=1
         ):
             (submitted_operator, submitted_operands), (redrawn_operator, redrawn_operands) = (
-                operations
+                submitted,
+                redrawn,
             )
             if redrawn_operator == "Tf":
                 font_name = str(redrawn_operands[0])
-            if operations[0] == operations[1] or (
-                submitted_operator == redrawn_operator
-                and _has_near_operands(redrawn_operator, submitted_operands, redrawn_operands)
-            ):
+            if _is_same_operation(submitted, redrawn):
                 continue
             if not {submitted_operator, redrawn_operator} <= _TEXT_OPERATORS:
                 operator_text = one_line(redrawn_operator, 9)
                 return f"PDF drawing operation {number} ({operator_text}) was changed"
-            texts = [self._decode_text(operands, font_name) for _, operands in operations]
+            submitted_text = self._decode_text(submitted_operands, font_name)
+            redrawn_text = self._decode_text(redrawn_operands, font_name)
             kerning = [abs(value) for value in submitted_operands if isinstance(value, float)]
-            has_small_kerning = max(kerning, default=0.0) < MAX_KERNING_PER_MILLE_EM
-            if texts[0] == texts[1] or not has_small_kerning or not self.is_same_text(*texts):
-                submitted_text, redrawn_text = (one_line(text, 60) for text in texts)
+            # if the texts are equal, only the kerning was changed
+            if (
+                submitted_text == redrawn_text
+                or max(kerning, default=0.0) >= MAX_KERNING_PER_MILLE_EM
+                or not self.is_same_text(submitted_text, redrawn_text)
+            ):
                 return (
-                    f"the PDF contains the text {submitted_text!r}; px4fuse prints {redrawn_text!r}"
+                    f"the PDF contains the text {one_line(submitted_text, 60)!r}; px4fuse prints "
+                    f"{one_line(redrawn_text, 60)!r}"
                 )
         return ""
 
@@ -391,6 +396,7 @@ def _parse_drawing_operations(content: bytes) -> Iterator[Operation]:
     """Parse the content of a PDF page into drawing operators with their operands."""
     operands: list[Operand] = []
     for match in _TOKEN_PATTERN.finditer(content.decode("latin-1")):
+        # a literal string "(...)", a hexadecimal string "<...>", or another token
         string_text, hex_digits, token = match.groups("")
         if not token:
             operands.append(
@@ -405,6 +411,7 @@ def _parse_drawing_operations(content: bytes) -> Iterator[Operation]:
         else:
             yield token, tuple(operands)
             operands.clear()
+    # operands without an operator are compared too
     yield "", tuple(operands)
 
 
@@ -417,15 +424,16 @@ def _unescape(match: re.Match[str]) -> str:
     return _ESCAPED_CHARACTERS.get(escaped, escaped)
 
 
-def _has_near_operands(
-    operator: str, submitted_operands: Sequence[Operand], redrawn_operands: Sequence[Operand]
-) -> bool:
-    """Return True if the operands of a PDF drawing operator are equal within the tolerances."""
-    if len(submitted_operands) != len(redrawn_operands):
+def _is_same_operation(submitted: Operation, redrawn: Operation) -> bool:
+    """Return True if two PDF drawing operations are equal within the tolerances."""
+    if submitted == redrawn:
+        return True
+    operator, redrawn_operands = redrawn
+    if submitted[0] != operator or len(submitted[1]) != len(redrawn_operands):
         return False
     first_coordinate_operand_index = _FIRST_COORDINATE_INDEX.get(operator, len(redrawn_operands))
     for index, (submitted_operand, redrawn_operand) in enumerate(
-        zip(submitted_operands, redrawn_operands, strict=True)
+        zip(submitted[1], redrawn_operands, strict=True)
     ):
         if submitted_operand == redrawn_operand:
             continue

@@ -186,7 +186,11 @@ def _estimate_inflated_bytes(pdf: bytes, start: int, limit_bytes: int) -> int:
 
 
 def _walk_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, bool]]:
-    """Yield each PDF dictionary, with True for an action that only runs after a click on a link."""
+    """Yield each PDF dictionary, with True for an action that only runs after a click on a link.
+
+    Such an action is the value of the key /A. An object that another key refers to as well is
+    yielded twice, with True and with False.
+    """
     visited_references: set[tuple[IndirectObject, bool]] = set()
     missing_count = value_count = 0
     remaining_values: list[tuple[Any, bool]] = [(reader.trailer, False)]
@@ -229,6 +233,7 @@ def _find_unexpected_features(
     if action == "/URI" and not runs_only_after_click:
         yield "an action that opens a URL without a click"
     is_stream = isinstance(dictionary, StreamObject)
+    # a file specification without embedded file, or a stream whose content is in another file
     if ("/EF" not in dictionary and dictionary_type in {"/Filespec", "/F"}) or (
         is_stream and "/F" in dictionary
     ):
@@ -237,6 +242,7 @@ def _find_unexpected_features(
         filters = resolve_reference(dictionary.get("/Filter"))
         filters = filters if isinstance(filters, ArrayObject) else [filters]
         names = [_read_pdf_name(each) or "?" for each in filters if each is not None]
+        # a repeated filter could expand to a huge stream
         if not _ALLOWED_FILTERS.issuperset(names) or len(set(names)) < len(names):
             compression_text = one_line(" ".join(names[:3]), 60)
             yield f"a stream with unsupported compression ({compression_text})"
@@ -254,6 +260,8 @@ def _read_pdf_name(value: object) -> str | None:
 
 def _read_attachment(reader: pypdf.PdfReader) -> bytes:
     """Return the content of the attached file RESULTS_NAME; other attachments are an error."""
+    # a file specification refers to the stream of the file with /EF. Streams of the type
+    # /EmbeddedFile without file specification are found too: each stream once, by its identity
     file_specifications: list[DictionaryObject] = []
     streams: dict[int, Any] = {}
     unexpected_features: set[str] = set()

@@ -277,44 +277,49 @@ def _compare_with_new_report(
     mismatches, is_same_number, value_count = compare_results(
         to_json_dict(submitted_results), to_json_dict(new_results)
     )
-    reasons = [
+    values_reason = (
         f"all {value_count} values agree with a new run on the log (within "
         f"{RESULT_RELATIVE_TOLERANCE:g}, estimates within {ESTIMATE_RELATIVE_TOLERANCE:g})"
-    ]
+    )
     if mismatches:
         paths_text = join_first_names([mismatch.path for mismatch in mismatches], 3)
-        reasons = [
+        values_reason = (
             f"{len(mismatches)} of {value_count} values differ from a new run on the log: "
             f"{paths_text}"
-        ]
+        )
     page_differences = compare_pages(
         pdf, redrawn_pdf, partial(is_same_text_up_to_rounding, is_same_number=is_same_number)
     )
+    page_reasons = [each.sentence for each in page_differences[:MAX_LISTED_PAGE_DIFFERENCES]]
+    if (unlisted_count := len(page_differences) - MAX_LISTED_PAGE_DIFFERENCES) > 0:
+        page_reasons.append(f"{unlisted_count} further differences are not listed")
     # another PDF program or other library versions may change pages without a forgery
     is_from_other_program = any(difference.is_structural for difference in page_differences)
     other_libraries: set[tuple[str, str]] = set()
     if page_differences:
         submitted_libraries = submitted_results.provenance.libraries.items()
         other_libraries = submitted_libraries - new_results.provenance.libraries.items()
-    status: VerificationStatus = "verified"
     page_status: PageStatus = "differ" if page_differences else "same"
     if is_from_other_program or other_libraries:
-        status, page_status = "cannot verify", "not compared"
+        page_status = "not compared"
+    status: VerificationStatus = "verified"
+    reasons = [values_reason, *page_reasons]
     if mismatches:
         status = "numbers differ"
-    sentences = [each.sentence for each in page_differences[:MAX_LISTED_PAGE_DIFFERENCES]]
-    if (unlisted_count := len(page_differences) - MAX_LISTED_PAGE_DIFFERENCES) > 0:
-        sentences.append(f"{unlisted_count} further differences are not listed")
-    # the decisive reason is first: some tables show only one reason
-    reasons = sentences + reasons if status == "cannot verify" else reasons + sentences
-    remedy = ORIGINAL_PDF_REMEDY if is_from_other_program else ""
+    elif page_status == "not compared":
+        status = "cannot verify"
+        # the decisive reason is first: some tables show only one reason
+        reasons = [*page_reasons, values_reason]
+    remedy = ""
     if other_libraries:
         versions_text = one_line(", ".join(map(" ".join, sorted(other_libraries))), 300)
         reasons.append(
             f"the report was made with {versions_text}; this computer has other versions, so "
             "pages may look different"
         )
-        remedy = remedy or f"Verify the report with {versions_text}."
+        remedy = f"Verify the report with {versions_text}."
+    if is_from_other_program:
+        remedy = ORIGINAL_PDF_REMEDY
     if status == "verified":
         reasons.append(VERIFICATION_SCOPE_NOTE)
     return Verification(
@@ -380,6 +385,8 @@ def compare_results(
             mismatched_paths.append(path)
         elif recorded_value != new_value:
             unequal_numbers.append((float(recorded_value), float(new_value)))
+    # Compare the texts last: a number printed in a text may differ as a result differs, for example
+    # 0.15 and 0.16 for 0.1549999 and 0.1550001
     is_same_number = partial(is_same_number_up_to_rounding, unequal_numbers)
     mismatched_paths += [
         path

@@ -31,17 +31,6 @@ from px4fuse.results.answer_form import form_name, format_answer_form
 from px4fuse.simulation import flights
 from px4fuse.simulation.faults import parse_faults
 
-# Fields of a simulation whose true values are written to the answer key
-TRUE_VALUE_NAMES = (
-    "duration_s",
-    "sigma_z_m",
-    "sigma_a_m_s2",
-    "reported_sigma_m",
-    "clock_offset_to_add_s",
-    "path_length_m",
-    "closure_error_m",
-)
-
 
 def simulate_assigned_flight(
     secret: bytes,
@@ -59,7 +48,7 @@ def simulate_assigned_flight(
     )
     log = flights.to_ulog(simulation, is_assessed=True)
     sha256 = hashlib.sha256(log).hexdigest()
-    true_values = flights.make_answer_key(simulation)["truth"]
+    true_values = flights.compute_true_values(simulation)
     form_answers = replace(
         compute_form_answers(simulation, sha256),
         choices=select_choices(partial(draw_uniform, secret, student.student_id, kind)),
@@ -71,7 +60,10 @@ def simulate_assigned_flight(
         sha256=sha256,
         scenario=to_json_types(assigned_flight.scenario),
         mistakes=assigned_flight.mistake_options,
-        true_values={name: float(true_values[name]) for name in TRUE_VALUE_NAMES},
+        # numbers only: the answer key has no lists, such as the times of the outliers
+        true_values={
+            name: value for name, value in true_values.items() if isinstance(value, float)
+        },
         difficulty=assigned_flight.difficulty,
         form=form_answers,
     )
@@ -136,15 +128,17 @@ def write_assignment(
         key = read_answer_key(key_file) if key_file.exists() else AnswerKey(kind, ())
     answers = {normalise_text(answer.student_id): answer for answer in key.answers}
     # an answer key without these students belongs to another class
-    is_known_student = [normalise_text(student.student_id) in answers for student in students]
-    is_key_of_this_class = not answers or any(is_known_student)
+    is_key_of_this_class = not answers or any(
+        normalise_text(student.student_id) in answers for student in students
+    )
     _require_answer_key_of_same_flights(key_file, key.kind == kind and is_key_of_this_class)
-    stored_secret = key.secret
     if secret is None:
-        stored_secret = stored_secret or secrets.token_urlsafe(24)
+        # an existing answer key contains the secret of its flights
+        stored_secret = key.secret or secrets.token_urlsafe(24)
         secret = derive_hmac_key(stored_secret)
-    elif derive_hmac_key(stored_secret) != secret:
-        stored_secret = ""
+    else:
+        # a secret that the user gave is not written to a file
+        stored_secret = key.secret if derive_hmac_key(key.secret) == secret else ""
     written_count = 0
     for finished_count, student in enumerate(students, start=1):
         log, answer = simulate_assigned_flight(
@@ -152,6 +146,7 @@ def write_assignment(
         )
         stored_answer = answers.setdefault(normalise_text(student.student_id), answer)
         _require_answer_key_of_same_flights(key_file, stored_answer.sha256 == answer.sha256)
+        # the questions must be those of the answer key, also if an earlier version wrote the key
         choices = stored_answer.form.choices if stored_answer.form else ()
         empty_form = format_answer_form(
             student.log_file_name, answer.sha256, [choice for choice, _ in choices]
@@ -166,6 +161,7 @@ def write_assignment(
             for path, content in content_by_path.items()
             if not _exists_with_same_content(path, content)
         }
+        # a figure is never compared: its bytes depend on the version of Matplotlib
         figures_file = log_file.with_suffix(".png")
         if not figures_file.exists():
             missing_content_by_path[figures_file] = draw_figures(

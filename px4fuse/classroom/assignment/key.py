@@ -1,9 +1,8 @@
 """Answer key of an assignment: flight, injected faults and right answers of each student."""
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -38,7 +37,7 @@ from px4fuse.results.answer_form import (
     select_questions,
 )
 from px4fuse.simulation import flights
-from px4fuse.simulation.faults import FAULT_TYPES
+from px4fuse.simulation.faults import FAULT_TYPES, injected_fault_names
 from px4fuse.simulation.sensors import TIMESYNC_CONVERGENCE_TIME_S
 
 # Maximum relative error of the size of a fault in a student's answer
@@ -52,7 +51,7 @@ MIN_RESET_M = 0.2
 # Time (s) at the start in which position resets are ignored: EKF2 resets to its first position
 INITIAL_TIME_WITHOUT_RESETS_S = 5.0
 # Faults for which a student must ("required") or may ("allowed") report a behaviour of EKF2
-EKF2_BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, tuple[str, ...]]], "did.toml")
+EKF2_BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, str]], "did.toml")
 # Maximum size (bytes) of an answer key: the key of 1000 students has 2 million bytes
 MAX_KEY_BYTES = 20_000_000
 ANSWER_KEY_NOTE = (
@@ -205,7 +204,7 @@ def read_answer_key(path: Path) -> AnswerKey:
         key = msgspec.json.decode(text, type=AnswerKey)
         if len({normalise_text(answer.student_id) for answer in key.answers}) < len(key.answers):
             raise ValueError("two students have the same id")
-    except (msgspec.MsgspecError, RecursionError, ValueError) as error:
+    except (RecursionError, ValueError) as error:
         raise SettingsError(
             f"{path} is not an answer key, or is from another px4fuse version ({error}).",
             "Give the answer key that px4fuse simulate --assignment wrote.",
@@ -218,13 +217,12 @@ def read_answer_key(path: Path) -> AnswerKey:
 
 def compute_form_answers(simulation: flights.Simulation, log_sha256: str) -> CorrectFormAnswers:
     """Compute the right answers from the simulated flight and its analysis by px4fuse."""
-    answer_key = flights.make_answer_key(simulation)
     comparison = compare_simulation(simulation)
     faults = tuple(
-        _make_injected_fault(name, values, answer_key["truth"], comparison)
-        for name, values in answer_key["mistakes"].items()
+        _make_injected_fault(name, simulation, comparison)
+        for name in injected_fault_names(simulation.faults)
     )
-    sigma_z_m = answer_key["truth"]["sigma_z_m"]
+    sigma_z_m = simulation.scenario.source_sigma_m
     return CorrectFormAnswers(
         faults,
         sigma_z_m,
@@ -251,12 +249,13 @@ def compare_simulation(simulation: flights.Simulation) -> Comparison:
 
 
 def _make_injected_fault(
-    name: str, values: Mapping[str, Any], truth: Mapping[str, Any], comparison: Comparison
+    name: str, simulation: flights.Simulation, comparison: Comparison
 ) -> InjectedFault:
     value_field_names = FAULT_TYPES[name].value_field_names
     if not value_field_names:
         return InjectedFault(name)
-    size = values[value_field_names[0]]
+    size = getattr(simulation.faults, value_field_names[0])
+    start_s, end_s = _find_fault_time(name, size, simulation)
     tolerance = FAULT_SIZE_TOLERANCE_FRACTION * abs(size)
     if name == "open-end":
         # the student can only measure the closure error, which includes the odometry drift
@@ -266,22 +265,31 @@ def _make_injected_fault(
         tolerance = CLOSURE_TOLERANCE_M
     low, high = size - tolerance, size + tolerance
     if name == "clock-offset":
-        # the estimated correction has the opposite sign of the time offset
+        # also accept the estimate of px4fuse, a correction with the opposite sign of the fault
         _, time_offset = estimate_noises_and_time_offset(comparison)
         if isinstance(time_offset, SourceTimeOffset) and time_offset.is_determinable:
-            low, high = min(low, -time_offset.interval_s[1]), max(high, -time_offset.interval_s[0])
-    fault_start_s = fault_end_s = None
-    match name:
-        case "clock-jump":
-            fault_end_s = TIMESYNC_CONVERGENCE_TIME_S
-        case "open-end":
-            _, fault_start_s = truth["airborne_s"]
-        case "nlos" if truth["outlier_time_s"]:
-            fault_start_s, *_, fault_end_s = truth["outlier_time_s"] * 2
-        case "dropout" | "imu-dropout" | "jump" | "heading" | "mag":
-            fault_start_s = values[value_field_names[1]]
-            fault_end_s = fault_start_s + abs(size) if name.endswith("dropout") else None
-    return InjectedFault(name, size, low, high, fault_start_s, fault_end_s)
+            lowest_correction_s, highest_correction_s = time_offset.interval_s
+            low, high = min(low, -highest_correction_s), max(high, -lowest_correction_s)
+    return InjectedFault(name, size, low, high, start_s, end_s)
+
+
+def _find_fault_time(
+    name: str, size: float, simulation: flights.Simulation
+) -> tuple[float | None, float | None]:
+    """Return start and end of a fault; None for the start or the end of the flight."""
+    if name == "clock-jump":
+        return None, TIMESYNC_CONVERGENCE_TIME_S
+    if name == "open-end":
+        return simulation.motion.touch_down_s, None
+    outlier_times_s = simulation.positions.outlier_times_s.tolist()
+    if name == "nlos" and outlier_times_s:
+        return outlier_times_s[0], outlier_times_s[-1]
+    last_field_name = FAULT_TYPES[name].value_field_names[-1]
+    if not last_field_name.endswith("_at_s"):
+        return None, None
+    start_s = getattr(simulation.faults, last_field_name)
+    # the size of a dropout is its duration; other faults last until the end
+    return start_s, start_s + size if name.endswith("dropout") else None
 
 
 def _determine_right_verdict(comparison: Comparison, filter_name: FilterName) -> CorrectVerdict:
@@ -297,14 +305,16 @@ def _find_ekf2_behaviours(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the behaviours of EKF2 that a student must report, and those a student may report."""
     size_by_kind = {fault.kind: fault.size or 0.0 for fault in faults}
-    required, allowed = (
-        [
+    kinds = size_by_kind.keys()
+
+    def list_behaviours(rule: str) -> list[str]:
+        return [
             behaviour
-            for behaviour, kinds in EKF2_BEHAVIOUR_RULES[rule].items()
-            if not size_by_kind.keys().isdisjoint(kinds)
+            for behaviour, rule_kinds in EKF2_BEHAVIOUR_RULES[rule].items()
+            if not kinds.isdisjoint(rule_kinds.split())
         ]
-        for rule in ("required", "allowed")
-    )
+
+    required, allowed = list_behaviours("required"), list_behaviours("allowed")
     if size_by_kind.get("ekf2-noise", 0.0) > sigma_z_m:
         required.append("weighted the positions too little")
     innovations = comparison.main.ekf2_tracks.innovations
@@ -312,23 +322,30 @@ def _find_ekf2_behaviours(
         not isinstance(innovations, Unavailable)
         and (innovations["rejected"] > 0).mean() > MIN_REJECTED_FRACTION
     ):
-        has_bad_samples = not size_by_kind.keys().isdisjoint({"nlos", "jump"})
+        has_bad_samples = not kinds.isdisjoint({"nlos", "jump"})
         required.append("rejected outliers" if has_bad_samples else "rejected good samples")
+    if _has_position_reset(comparison):
+        required.append("dead-reckoned, then reset")
+    if "never fused" in required:
+        # other behaviours result from this behaviour, so the student need not report them
+        required, allowed = ["never fused"], [*required, *allowed]
+    elif not required:
+        required, allowed = ["normal"], ["followed the positions", *allowed]
+    # list each behaviour once
+    further_behaviours = [each for each in dict.fromkeys(allowed) if each not in required]
+    return tuple(required), tuple(further_behaviours)
+
+
+def _has_position_reset(comparison: Comparison) -> bool:
+    """Return True if EKF2 reset its position to a clearly different position in flight."""
     ekf2 = comparison.flight.ekf2
     earliest_counted_reset_time_s = comparison.segment.start_s + INITIAL_TIME_WITHOUT_RESETS_S
-    if any(
+    return isinstance(ekf2, Ekf2) and any(
         reset.quantity == "position"
         and reset.time_s > earliest_counted_reset_time_s
         and math.hypot(*reset.delta[:2]) > MIN_RESET_M
-        for reset in (ekf2.resets if isinstance(ekf2, Ekf2) else ())
-    ):
-        required.append("dead-reckoned, then reset")
-    # if EKF2 never fuses positions, its other behaviours need not be reported
-    if "never fused" in required:
-        required, allowed = ["never fused"], [*required, *allowed]
-    if not required:
-        required, allowed = ["normal"], ["followed the positions", *allowed]
-    return tuple(required), tuple(each for each in dict.fromkeys(allowed) if each not in required)
+        for reset in ekf2.resets
+    )
 
 
 def compute_numeric_answer(
@@ -337,27 +354,28 @@ def compute_numeric_answer(
     """Run KF to compute the right answer to a question; None with too few measurements."""
     settings = Settings(question.sigma_a_m_s2, question.sigma_z_m)
     kf_run = run_kf(axis_comparison.axis, settings)
+    # the first of these updates is the update of the question
     updates = kf_run.updates.iloc[question.update_number - 1 :]
     if updates.empty:
         return None
-    covariance = kf_run.steps.loc[updates.index[0], COVARIANCE_COLUMNS]
     nis = updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]
-    match question.kind:
-        case "gate":
-            is_outside = (
-                nis.iloc[: GATE_QUESTION_FURTHER_UPDATES + 1] > question.question_parameter**2
-            )
-            rejected_update_numbers = np.flatnonzero(is_outside) + question.update_number
-            return tuple(rejected_update_numbers.astype(float).tolist())
-        case "prediction":
-            p, f = make_symmetric_matrix(tuple(covariance)), make_transition_matrix(settings.dt_s)
-            q = make_symmetric_matrix(compute_process_noise_per_density(settings.dt_s))
-            q *= settings.sigma_a_m_s2**2 * settings.dt_s
-            for _ in range(round(question.question_parameter / settings.dt_s)):
-                p = f @ p @ f.T + q
-            return math.sqrt(p[0, 0])
-        case "nis":
-            return float(nis.iloc[0])
-        case "variance":
-            return float(covariance.iloc[0])
-    return float(updates.iloc[0]["gain_position" if question.kind == "gain" else "innovation_m"])
+    if question.kind == "gate":
+        is_outside = nis.iloc[: GATE_QUESTION_FURTHER_UPDATES + 1] > question.question_parameter**2
+        rejected_update_numbers = np.flatnonzero(is_outside) + question.update_number
+        return tuple(rejected_update_numbers.astype(float).tolist())
+    covariance = kf_run.steps.loc[updates.index[0], COVARIANCE_COLUMNS]
+    if question.kind == "prediction":
+        # propagate the covariance without updates: P = F P Fᵀ + Q
+        p, f = make_symmetric_matrix(tuple(covariance)), make_transition_matrix(settings.dt_s)
+        q = make_symmetric_matrix(compute_process_noise_per_density(settings.dt_s))
+        q *= settings.sigma_a_m_s2**2 * settings.dt_s
+        for _ in range(round(question.question_parameter / settings.dt_s)):
+            p = f @ p @ f.T + q
+        return math.sqrt(p[0, 0])
+    value_by_kind = {
+        "gain": updates["gain_position"].iloc[0],
+        "innovation": updates["innovation_m"].iloc[0],
+        "nis": nis.iloc[0],
+        "variance": covariance.iloc[0],
+    }
+    return float(value_by_kind[question.kind])

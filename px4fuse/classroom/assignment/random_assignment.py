@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import math
 from bisect import bisect
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -85,28 +84,28 @@ class AssignableFault(Record):
         is_masked = other_fault.group in (self.group, *self.masked_fault_groups.split())
         return not is_masked and self.group not in other_fault.masked_fault_groups.split()
 
-    def format_option(self, difficulty: float, sign: float, fault_start_fraction: float) -> str:
+    def format_option(self, difficulty: float, draw_number: Callable[[str], float]) -> str:
         """Return the value of the option ``px4fuse simulate --mistake`` for this fault.
 
         Parameters
         ----------
         difficulty : float
             Smallest size that px4fuse detects, divided by the size of the fault in the flight.
-        sign : float
-            Sign of the size, 1 or -1.
-        fault_start_fraction : float
-            Start of the fault: 0 for the earliest start, 1 for the latest start.
+        draw_number : callable
+            Returns a random number in [0, 1) for the name of a quantity.
         """
         if not self.detection_limit:
             return self.name
         size = self.detection_limit / difficulty
         if self.is_smaller_size_easier_to_detect:
             size = self.detection_limit * difficulty
-        option_value = f"{self.name}={math.copysign(float(f'{size:.3g}'), sign):g}{self.unit}"
+        if self.has_either_sign and draw_number(f"sign {self.name}") < 0.5:
+            size = -size
+        option_value = f"{self.name}={float(f'{size:.3g}'):g}{self.unit}"
         if not self.latest_start_s:
             return option_value
         start_range_s = self.latest_start_s - self.earliest_start_s
-        start_s = self.earliest_start_s + fault_start_fraction * start_range_s
+        start_s = self.earliest_start_s + start_range_s * draw_number(f"at {self.name}")
         return f"{option_value},{start_s:.0f}s"
 
 
@@ -184,27 +183,27 @@ def assign_random_flight(
         kind = "loop" if is_loop else "aisle"
     draw_number = partial(draw_uniform, secret, student_id, kind)
     if fault_count is None:
-        fault_count = bisect(
-            list(accumulate(PROBABILITY_BY_FAULT_COUNT[kind][:-1])), draw_number("count")
-        )
+        # index of the first cumulative probability that is larger than the random number
+        *cumulative_probabilities, _ = accumulate(PROBABILITY_BY_FAULT_COUNT[kind])
+        fault_count = bisect(cumulative_probabilities, draw_number("count"))
+    faults: list[AssignableFault] = []
+    possible_faults = (fault for fault in ASSIGNABLE_FAULTS if fault.flight_kind == kind)
+    for fault in sorted(possible_faults, key=lambda each: draw_number(f"order {each.name}")):
+        if len(faults) < fault_count and all(map(fault.is_detectable_with, faults)):
+            faults.append(fault)
     low, high = EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
     if draw_number("undetectable") < DIFFICULT_FAULTS_PROBABILITY:
         low, high = HARDEST_DIFFICULTY, MAX_FAULT_DIFFICULTY
-    faults: list[AssignableFault] = []
-    difficulties, mistake_options = [], []
-    possible_faults = (fault for fault in ASSIGNABLE_FAULTS if fault.flight_kind == kind)
-    for fault in sorted(possible_faults, key=lambda each: draw_number(f"order {each.name}")):
-        if len(faults) == fault_count or not all(map(fault.is_detectable_with, faults)):
-            continue
-        faults.append(fault)
-        difficulty = EASIEST_DIFFICULTY
-        if fault.detection_limit:
-            difficulty = low + (high - low) * draw_number(f"size {fault.name}")
-        sign = -1.0 if fault.has_either_sign and draw_number(f"sign {fault.name}") < 0.5 else 1.0
-        difficulties.append(difficulty)
-        mistake_options.append(
-            fault.format_option(difficulty, sign, draw_number(f"at {fault.name}"))
-        )
+    difficulties = [
+        low + (high - low) * draw_number(f"size {fault.name}")
+        if fault.detection_limit
+        else EASIEST_DIFFICULTY
+        for fault in faults
+    ]
+    mistake_options = tuple(
+        fault.format_option(difficulty, draw_number)
+        for fault, difficulty in zip(faults, difficulties, strict=True)
+    )
     scenario = make_scenario(
         kind,
         truth=with_ground_truth and kind == "aisle",
@@ -212,7 +211,7 @@ def assign_random_flight(
         **draw_scenario_numbers(kind, draw_number),
     )
     return AssignedFlight(
-        scenario, tuple(mistake_options), round(max(difficulties, default=HARDEST_DIFFICULTY), 2)
+        scenario, mistake_options, round(max(difficulties, default=HARDEST_DIFFICULTY), 2)
     )
 
 

@@ -30,7 +30,10 @@ MAX_STEM_LENGTH = 48
 WINDOWS_RESERVED_NAMES = {"con", "prn", "aux", "nul"} | {
     f"{n}{i}" for n in ("com", "lpt") for i in range(10)
 }
-TITLES_BY_FIELD = read_toml(__file__, dict[str, tuple[str, ...]], "columns.toml")
+TITLES_BY_FIELD = {
+    field_name: titles.split()
+    for field_name, titles in read_toml(__file__, dict[str, str], "columns.toml").items()
+}
 # Fields that are copied from other tables if the class list lacks them
 FIELDS_FROM_OTHER_TABLES = ("name", "email", "login", "submission_time", "extended_due")
 # Names in Canvas gradebooks that are not students ("Points Possible", "Student, Test")
@@ -244,10 +247,13 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
     if re.sub(r"\W", "", name.casefold()) in NON_STUDENT_ROW_NAMES:
         return None
     numbers = {}
+    # worksheet of Moodle: "Identifier" is "Participant 123"
     if participant := re.search(r"\d+$", sheet.find_cell(row, ("identifier",))):
         numbers["moodle"] = participant[0]
+    # gradebook of Canvas: "ID" is the number of Canvas, and "SIS User ID" is the student id
     if sheet.find_column_index(("sisuserid", "sisloginid")) is not None:
-        numbers |= {"canvas": number} if (number := sheet.find_cell(row, ("id",))) else {}
+        if canvas_number := sheet.find_cell(row, ("id",)):
+            numbers["canvas"] = canvas_number
         cells["student_id"] = one_line(sheet.find_cell(row, ("sisuserid",)), MAX_NAME_LENGTH)
     student_id = cells["student_id"] or cells["login"] or cells["email"]
     person = Person(
@@ -326,13 +332,15 @@ def is_same_name(name: str, other_name: str) -> bool:
     >>> is_same_name("Ada", "ada lovelace"), is_same_name("", "")
     (False, False)
     """
-    shorter, longer = sorted(
-        (re.findall(r"[^\W_]+", normalise_text(text)) for text in (name, other_name)), key=len
+    words, other_words = (
+        re.findall(r"[^\W_]+", normalise_text(text)) for text in (name, other_name)
     )
-    if len(shorter) == 1 < len(longer):
-        rotations = (longer[start:] + longer[:start] for start in range(len(longer)))
-        return shorter[0] in map("".join, rotations)
-    return sorted(shorter) == sorted(longer) != []
+    if sorted(words) == sorted(other_words):
+        return bool(words)
+    # one name may be joined, and begin with any of the words: "lovelaceada"
+    shorter, longer = sorted((words, other_words), key=len)
+    rotations = ("".join(longer[start:] + longer[:start]) for start in range(len(longer)))
+    return len(shorter) == 1 and shorter[0] in rotations
 
 
 def make_file_stem(student_id: str) -> str | None:

@@ -129,10 +129,10 @@ class ScoringInput:
     @cached_property
     def is_own_log(self) -> bool:
         """True if the report is about the log that the instructor gave to the student."""
-        assigned_sha256 = (
-            self.right_answers_for_assigned_log and self.right_answers_for_assigned_log.sha256
+        assigned = self.right_answers_for_assigned_log
+        return self.key is None or (
+            assigned is not None and assigned.sha256 == log_sha256(self.results)
         )
-        return self.key is None or assigned_sha256 == log_sha256(self.results)
 
     @cached_property
     def form(self) -> Answers | str:
@@ -155,11 +155,11 @@ class ScoringInput:
     @cached_property
     def form_points(self) -> FormPoints | str:
         """Points for the student's answers, or the reason for no points."""
-        right_answers_for_assigned_log = self.right_answers_for_assigned_log
-        if self.right_answers is None or (right_answers_for_assigned_log and not self.is_own_log):
-            file_text = format_reason(
-                right_answers_for_assigned_log.file if right_answers_for_assigned_log else ""
-            )
+        assigned = self.right_answers_for_assigned_log
+        # accept the log of any student if the answer key does not contain this student
+        is_other_log = assigned is not None and not self.is_own_log
+        if self.right_answers is None or is_other_log:
+            file_text = format_reason(assigned.file if assigned else "")
             return (
                 f"this report is not about the log that you were given{file_text}. Make a "
                 "report of that log, with your --id"

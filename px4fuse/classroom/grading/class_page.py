@@ -73,7 +73,6 @@ def format_class_page(grades: Sequence[Grade], title: str, version_text: str) ->
 def _format_statistics(grades: Sequence[Grade], count_by_tag: Mapping[str, int]) -> str:
     """Format the statistics of the class: reports by status, and points of students and items."""
     totals = [grade.total for grade in grades if grade.total is not None]
-    max_points = max((grade.max_points for grade in grades), default=0.0) or 1.0
     reports = counted_reports(grades)
     pending_points = [report.points for report in reports if report.instructor_action]
     # title, value and note; zeros are not shown
@@ -85,7 +84,7 @@ def _format_statistics(grades: Sequence[Grade], count_by_tag: Mapping[str, int])
         ("Late", count_by_tag["late"], ""),
     ]
     if totals:
-        maximum_text = f"of {max_points:g}"
+        maximum_text = f"of {max(grade.max_points for grade in grades):g}"
         numbers += [
             ("Mean points", f"{statistics.fmean(totals):.1f}", maximum_text),
             ("Median points", f"{statistics.median(totals):.1f}", maximum_text),
@@ -190,6 +189,7 @@ def _make_grade_details(grade: Grade) -> Iterator[RowDetailsSection]:
 def _make_points_cell(grade: Grade) -> Cell:
     report = grade.counted_report
     if grade.total is None:
+        # pending: the points wait for a decision of the instructor
         if report is None or report.counted_points is not None:
             return Cell("–")
         return Cell("pending", None, f"{format_cell_number(report.points)} proposed")
@@ -256,26 +256,25 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
     The items are those of the rubric, the parts of the answer form, and the injected faults. A
     fault gives one point if the student named it.
     """
-    item_scores, form_scores, fault_scores = (
-        defaultdict[str, list[tuple[float, float, float]]](list) for _ in range(3)
-    )
-    for report in reports:
-        if report.instructor_action:
-            continue
-        for prefix, items, scores_by_title in (
-            ("", report.items, item_scores),
-            ("Answer form: ", report.form_part_scores, form_scores),
-        ):
+    final_reports = [report for report in reports if not report.instructor_action]
+    # points, maximum points and points for all other items of each report
+    scores_by_title = defaultdict[str, list[tuple[float, float, float]]](list)
+    for prefix, items_by_report in (
+        ("", [report.items for report in final_reports]),
+        ("Answer form: ", [report.form_part_scores for report in final_reports]),
+    ):
+        for items in items_by_report:
             total_points = sum(item.points for item in items)
             for item in items:
                 if not item.is_awaiting_points:
-                    scores_by_title[f"{prefix}{item.title}"].append(
+                    scores_by_title[prefix + item.title].append(
                         (item.points, item.max_points, total_points - item.points)
                     )
+    for report in final_reports:
         for kind, is_named in report.did_student_name_fault.items():
-            fault_scores[f"Fault: {kind}"].append((float(is_named), 1.0, report.points))
+            scores_by_title[f"Fault: {kind}"].append((float(is_named), 1.0, report.points))
     statistics = []
-    for title, scores in (item_scores | form_scores | fault_scores).items():
+    for title, scores in scores_by_title.items():
         points, max_points, other_points = np.transpose(scores)
         discrimination = None
         has_variation = np.ptp(points) > 0.0 and np.ptp(other_points) > 0.0

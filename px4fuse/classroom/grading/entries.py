@@ -6,12 +6,11 @@ Points that the instructor writes into ``overrides.csv`` replace the computed po
 import math
 import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, tzinfo
 from functools import cached_property
-from operator import attrgetter
 from pathlib import Path
 from typing import Literal, NamedTuple
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
@@ -29,6 +28,7 @@ from px4fuse.classroom.assignment.roster import (
 )
 from px4fuse.classroom.grading.model import (
     TOTAL_TITLE,
+    ExportOrigin,
     Grade,
     GradedReport,
     GradeOverride,
@@ -153,10 +153,6 @@ class _Candidate(NamedTuple):
     report: GradedReport
     grade: Grade
 
-    @property
-    def points_after_deduction(self) -> float:
-        return max(self.report.points - self.grade.deducted_points, 0.0)
-
 
 def build_grades(
     reports: Sequence[GradedReport],
@@ -178,30 +174,7 @@ def build_grades(
     notes : tuple of str
         Sentences about missing times, and about points without a matching student or item.
     """
-    has_class_list = bool(course.class_list.people)
-    class_list = course.class_list if has_class_list else _collect_students(reports, submissions)
-    candidates_by_student_index: dict[int | None, list[_Candidate]] = defaultdict(list)
-    for report, submission in zip(reports, submissions, strict=True):
-        student_index = class_list.find_student_index(submission.origin.person)
-        if student_index is None:
-            student_index = class_list.find_student_index(Person(report.student_id, report.student))
-        candidates_by_student_index[student_index].append(
-            _make_candidate(report, submission, course, student_index, class_list)
-        )
-    max_points = max((report.max_points for report in reports), default=0.0)
-    grades = [
-        _choose_counted_report(candidates_by_student_index[student_index], course)
-        if candidates_by_student_index[student_index]
-        else Grade(person.name, person.student_id, None, max_points=max_points)
-        for student_index, person in enumerate(class_list.people)
-    ]
-    unknown_student_flag = "Neither the report nor the learning platform names a student."
-    if has_class_list:
-        unknown_student_flag = "The student is not in the class list."
-    grades += [
-        replace(grade, flags=(unknown_student_flag, *grade.flags))
-        for *_, grade in candidates_by_student_index[None]
-    ]
+    grades = _choose_reports(reports, submissions, course)
     overrides_per_grade, notes = match_overrides(overrides, grades)
     flags_by_submission = flag_equal_contents(counted_reports(grades))
     grades_with_report = [grade for grade in grades if grade.counted_report]
@@ -212,10 +185,43 @@ def build_grades(
             "students, so no points were deducted. Add the times with --worksheet."
         )
     final_grades = (
-        _apply_overrides(*grade_and_overrides, flags_by_submission, course)
-        for grade_and_overrides in zip(grades, overrides_per_grade, strict=True)
+        _apply_overrides(grade, override_by_title, flags_by_submission, course)
+        for grade, override_by_title in zip(grades, overrides_per_grade, strict=True)
     )
     return tuple(final_grades), tuple(notes)
+
+
+def _choose_reports(
+    reports: Sequence[GradedReport], submissions: Sequence[Submission], course: Course
+) -> list[Grade]:
+    """Assign the reports to students, and choose the report that counts for each student.
+
+    Each report of an unknown student gets a grade.
+    """
+    class_list, unknown_student_flag = course.class_list, "The student is not in the class list."
+    if not class_list.people:
+        class_list = _collect_students(reports, submissions)
+        unknown_student_flag = "Neither the report nor the learning platform names a student."
+    candidates_by_student_index: dict[int, list[_Candidate]] = defaultdict(list)
+    grades_of_unknown_students = []
+    for report, submission in zip(reports, submissions, strict=True):
+        student_index = class_list.find_student_index(submission.origin.person)
+        if student_index is None:
+            student_index = class_list.find_student_index(Person(report.student_id, report.student))
+        candidate = _make_candidate(report, submission, course, student_index, class_list)
+        if student_index is None:
+            flags = (unknown_student_flag, *candidate.grade.flags)
+            grades_of_unknown_students.append(replace(candidate.grade, flags=flags))
+        else:
+            candidates_by_student_index[student_index].append(candidate)
+    max_points = max((report.max_points for report in reports), default=0.0)
+    grades_of_students = (
+        _choose_counted_report(candidates, course)
+        if (candidates := candidates_by_student_index[student_index])
+        else Grade(person.name, person.student_id, None, max_points=max_points)
+        for student_index, person in enumerate(class_list.people)
+    )
+    return [*grades_of_students, *grades_of_unknown_students]
 
 
 def _collect_students(
@@ -226,15 +232,18 @@ def _collect_students(
     for report, submission in zip(reports, submissions, strict=True):
         person = submission.origin.person
         reported_student_index = class_list.find_student_index(Person(report.student_id))
-        if person.numbers or person.login:
+        if person.numbers or person.login:  # the learning platform identifies the student
             if class_list.find_student_index(person) is not None:
                 continue
-            # ignore the id in the report if another student already has this id
-            unused_reported_id = report.student_id if reported_student_index is None else ""
-            student_id = person.student_id or unused_reported_id
-            name = one_line(report.student if student_id else person.name, 200) or person.name
-            student_id = next(filter(None, (student_id, person.login, *person.numbers.values())))
-            class_list.people.append(replace(person, student_id=student_id, name=name))
+            student_id, name = person.student_id, person.name
+            if not student_id and reported_student_index is None:
+                student_id = report.student_id
+            if student_id:
+                name = report.student.strip() or name
+            else:  # do not use the report: it has no id, or that of another student
+                student_id = person.login or " ".join(person.numbers.values())
+            person = replace(person, student_id=student_id, name=one_line(name, 200))
+            class_list.people.append(person)
         elif report.student_id and reported_student_index is None:
             class_list.people.append(Person(report.student_id, one_line(report.student, 200)))
     return class_list
@@ -251,43 +260,24 @@ def _make_candidate(
 
     The grade applies only if the report is chosen from all reports of the student.
     """
-    origin, platform = submission.origin, submission.origin.platform.capitalize()
+    origin = submission.origin
     person = (
         Person(report.student_id) if student_index is None else class_list.people[student_index]
     )
-    due_time, late_rule = course.due, course.late_rule
+    due_time = course.due
     if due_time is not None and person.extended_due:
         name = f"extension of {one_line(person.student_id, 40)}:"
         due_time = parse_due_time(person.extended_due, name, due_time.tzinfo)
     submission_time = origin.time or parse_moodle_time(person.submission_time)
     if submission_time is not None:
         submission_time = add_time_zone(submission_time, due_time)
-    lateness_s, deducted_points, flags = None, 0.0, []
+    lateness_s, deducted_points = None, 0.0
     if due_time is not None and submission_time is not None:
         # UNIX times, because differences of datetime objects ignore daylight saving time
         lateness_s = submission_time.timestamp() - due_time.timestamp()
         lateness_s = lateness_s if lateness_s > course.grace_s else 0.0
-        if late_rule is not None:
-            deducted_points = late_rule.compute_deduction(lateness_s, report.max_points)
-    elif origin.is_late:
-        flags.append(
-            f"{platform} marks the file as late, but states no submission time, so no points were "
-            "deducted."
-        )
-    if origin.has_forged_platform_name:
-        flags.append(
-            "The student chose a file name that only learning platforms give. Check who handed in "
-            "the file."
-        )
-    reported_student_index = (
-        class_list.find_student_index(Person(report.student_id)) if platform else None
-    )
-    if reported_student_index is not None and student_index not in (None, reported_student_index):
-        reported_person = class_list.people[reported_student_index]
-        flags.append(
-            f"The id in the report is that of {reported_person.student_id} "
-            f"({reported_person.name or 'no name'}), but {platform} names another student."
-        )
+        if course.late_rule is not None:
+            deducted_points = course.late_rule.compute_deduction(lateness_s, report.max_points)
     grade = Grade(
         person.name or one_line(report.student or origin.person.name, 200),
         person.student_id,
@@ -296,41 +286,79 @@ def _make_candidate(
         lateness_s=lateness_s,
         deducted_points=deducted_points,
         max_points=report.max_points,
-        flags=tuple(flags),
+        flags=tuple(_flag_submission(report, origin, lateness_s, student_index, class_list)),
     )
     time_s = submission_time.timestamp() if submission_time else 0.0
     return _Candidate(time_s, report, grade)
 
 
+def _flag_submission(
+    report: GradedReport,
+    origin: ExportOrigin,
+    lateness_s: float | None,
+    student_index: int | None,
+    class_list: ClassList,
+) -> Iterator[str]:
+    """Yield sentences about the time and the student of a submission."""
+    platform = origin.platform.capitalize()
+    if origin.is_late and lateness_s is None:
+        yield (
+            f"{platform} marks the file as late, but states no submission time, so no points were "
+            "deducted."
+        )
+    if origin.has_forged_platform_name:
+        yield (
+            "The student chose a file name that only learning platforms give. Check who handed in "
+            "the file."
+        )
+    reported_student_index = class_list.find_student_index(Person(report.student_id))
+    if (
+        platform
+        and reported_student_index is not None
+        and student_index not in (None, reported_student_index)
+    ):
+        reported_person = class_list.people[reported_student_index]
+        yield (
+            f"The id in the report is that of {reported_person.student_id} "
+            f"({reported_person.name or 'no name'}), but {platform} names another student."
+        )
+
+
 def _choose_counted_report(candidates: Sequence[_Candidate], course: Course) -> Grade:
     """Choose the report that counts for a student's grade."""
-    candidates = sorted(
-        candidates,
-        key=lambda each: (each.time_s, each.points_after_deduction, each.report.submission),
-    )
+    candidates = sorted(candidates, key=lambda each: each.time_s)
     # prefer reports without open decisions of the instructor
     readable = [each for each in candidates if each.report.version]
     final = [each for each in readable if not each.report.instructor_action]
     eligible = final or readable or candidates
-    chosen = eligible[-1]
-    if course.attempt == "first":
-        # of reports with the same time, the last has the most points
-        chosen = [each for each in eligible if each.time_s == eligible[0].time_s][-1]
-    elif course.attempt == "best":
-        chosen = max(reversed(eligible), key=attrgetter("points_after_deduction"))
+
+    def rank(candidate: _Candidate) -> tuple[float, float, str]:
+        points = max(candidate.report.points - candidate.grade.deducted_points, 0.0)
+        time_s = candidate.time_s
+        criteria = {
+            "latest": (time_s, points),
+            "first": (-time_s, points),
+            "best": (points, time_s),
+        }
+        # the name decides between reports with equal time and points
+        return (*criteria[course.attempt], candidate.report.submission)
+
+    chosen = max(eligible, key=rank)
     report, flags = chosen.report, list(chosen.grade.flags)
     # without this rule, students could hand in several answer forms with different guesses
-    forms = [each.report.form for each in eligible if each.time_s == chosen.time_s]
     if course.attempt == "best":
         if len({each.report.form for each in readable}) > 1:
             flags.append(
                 f"The student handed in {len(candidates)} reports with different answer forms."
             )
-    elif len(set(forms)) > 1:
-        action = (
-            f"The answer forms of {len(forms)} reports differ. Ask the student which report counts."
-        )
-        report = replace(report, instructor_action=action)
+    else:
+        forms = [each.report.form for each in eligible if each.time_s == chosen.time_s]
+        if len(set(forms)) > 1:
+            action = (
+                f"The answer forms of {len(forms)} reports differ. Ask the student which report "
+                "counts."
+            )
+            report = replace(report, instructor_action=action)
     others = [each for each in candidates if each is not chosen]
     for other in others:
         is_report = bool(other.report.version)
@@ -360,11 +388,11 @@ def _apply_overrides(
         )
         report = replace(report, items=tuple(items))
         flags = (*flags, *report.flags, *flags_by_submission.get(report.submission, ()))
+        # without include_pending, points with an open decision of the instructor do not count
         if report.counted_points is not None or course.include_pending:
             total_points = round(max(report.points - grade.deducted_points, 0.0), 2)
-    report_override, total_override = (
-        override_by_title.get(title, GradeOverride()) for title in ("", TOTAL_TITLE)
-    )
+    report_override = override_by_title.get("", GradeOverride())
+    total_override = override_by_title.get(TOTAL_TITLE, GradeOverride())
     return replace(
         grade,
         counted_report=report,
@@ -449,7 +477,7 @@ def match_overrides(
     -------
     matched_overrides : list of dict
         Points and comments for each student, by rubric item, "total", or "" (whole report).
-    notes : tuple of str
+    notes : list of str
         Sentences about points and comments without a matching student or item.
     """
     matched_overrides: list[dict[str, GradeOverride]] = [{} for _ in grades]
@@ -464,25 +492,26 @@ def match_overrides(
         if student_index is None:
             notes.append(f"{OVERRIDES_NAME}: no student has the id {student_text}.")
             continue
-        matched_override_by_title = matched_overrides[student_index]
+        override_by_title = matched_overrides[student_index]
         max_points_by_title = {TOTAL_TITLE: max_total_points, "": math.inf}
         if report := grades[student_index].counted_report:
             max_points_by_title[TOTAL_TITLE] = report.max_points
             max_points_by_title |= {item.title: item.max_points for item in report.items}
         title_by_normalised_title = {normalise_text(title): title for title in max_points_by_title}
         for item_title, override in override_by_item.items():
-            title = title_by_normalised_title.get(normalise_text(item_title))
-            if title is None:
+            title = title_by_normalised_title.get(normalise_text(item_title), item_title)
+            max_points, problem = max_points_by_title.get(title), ""
+            if max_points is None:
                 problem = f"student {student_text} has no item {one_line(item_title, 60)!r}"
-            elif title in matched_override_by_title:
+            elif title in override_by_title:
                 problem = f"student {student_text} has two rows for {title or 'the whole report'!r}"
-            elif (override.points or 0.0) > max_points_by_title[title]:
-                limit_text = f"{max_points_by_title[title]:g} points of {one_line(title, 60)!r}"
+            elif (override.points or 0.0) > max_points:
+                limit_text = f"{max_points:g} points of {one_line(title, 60)!r}"
                 problem = f"points of student {student_text} are above the maximum, {limit_text}"
+            if problem:
+                notes.append(f"{OVERRIDES_NAME}: {problem}.")
             else:
-                matched_override_by_title[title] = override
-                continue
-            notes.append(f"{OVERRIDES_NAME}: {problem}.")
+                override_by_title[title] = override
     return matched_overrides, notes
 
 
@@ -520,19 +549,22 @@ def parse_due_time(
     SettingsError
         The text is not a valid time.
     """
-    words = text.split()
+    words, time_zone = text.split(), default_time_zone
     try:
-        time_zone = ZoneInfo(words.pop()) if words and words[-1][0].isalpha() else default_time_zone
+        if words and words[-1][0].isalpha():
+            time_zone = ZoneInfo(words.pop())
+        # ISO 8601: date, "T", time of day and offset from UTC
         due_time = datetime.fromisoformat("T".join(words[:2]) + "".join(words[2:]))
     except (ZoneInfoNotFoundError, ValueError, OSError) as error:
         raise SettingsError(
             f"{name} {text!r} is not a valid time. Use '2026-11-20 23:59', optionally "
             "followed by a time zone ('+01:00' or 'Europe/Berlin')."
         ) from error
+    # a date means the end of the day, and a minute its last second
     time_of_day_match = re.search(r"\d\d:\d\d(:\d\d)?", text)
     if time_of_day_match is None:
-        due_time = due_time.replace(hour=23, minute=59)
-    if time_of_day_match is None or time_of_day_match[1] is None:
+        due_time = due_time.replace(hour=23, minute=59, second=59)
+    elif time_of_day_match[1] is None:
         due_time = due_time.replace(second=59)
     if due_time.tzinfo is not None:
         return due_time

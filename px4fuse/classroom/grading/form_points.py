@@ -7,6 +7,8 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import zip_longest
+from operator import itemgetter
+from typing import NamedTuple
 
 from px4fuse.classroom.assignment.key import CorrectFormAnswers, InjectedFault
 from px4fuse.classroom.grading.model import ItemScore
@@ -17,6 +19,7 @@ from px4fuse.results.answer_form import (
     NO_FAULT_KIND,
     NOT_AVAILABLE,
     Answers,
+    Choice,
     NamedFault,
     NumericAnswer,
     select_questions,
@@ -79,7 +82,7 @@ class CorrectionRule(Record):
 
 CORRECTION_RULES = read_csv(__file__, CorrectionRule, "corrections.csv")
 POINTS_CONFIG = read_toml(__file__, dict)
-SIMILAR_FAULT_GROUPS = [set(kinds) for kinds in POINTS_CONFIG["neighbours"].values()]
+SIMILAR_FAULT_GROUPS = [set(kinds.split()) for kinds in POINTS_CONFIG["neighbours"].values()]
 FORM_PART_NAMES = tuple(POINTS_CONFIG["weights"])
 
 
@@ -108,10 +111,18 @@ class FormPoints:
 def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> FormPoints:
     """Compare a student's answers with the right answers, and compute the points."""
     is_recognised_as_fault_free = not right_answers.mistakes and answers.declares_no_fault
-    weights = POINTS_CONFIG["weights_clean" if is_recognised_as_fault_free else "weights"]
+    flight_fraction = POINTS_FRACTION_OF_FLIGHT_QUESTIONS if right_answers.choices else 1.0
+    weights = {
+        name: flight_fraction * max_points
+        for name, max_points in POINTS_CONFIG[
+            "weights_clean" if is_recognised_as_fault_free else "weights"
+        ].items()
+    }
     scores = dict.fromkeys(FORM_PART_NAMES, 0.0)
     matches, wrongly_named_faults = _match_faults(answers, right_answers)
-    if right_answers.mistakes and len(wrongly_named_faults) < ZERO_POINTS_FALSE_FAULT_COUNT:
+    if is_recognised_as_fault_free:
+        scores["mistakes"] = 1.0
+    elif len(wrongly_named_faults) < ZERO_POINTS_FALSE_FAULT_COUNT:
         scores |= _score_faults(matches, right_answers)
     scores["numbers"] = _score_numbers(answers, right_answers)
     scores["verdicts"] = _score_verdicts(answers, right_answers)
@@ -119,19 +130,13 @@ def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> 
         # verdicts can be guessed, so they give half of the points if no computed number is right
         scores["verdicts"] *= 0.5
     points = {name: max_points * scores[name] for name, max_points in weights.items()}
-    if is_recognised_as_fault_free:
-        points["mistakes"] = weights["mistakes"]
-    elif right_answers.mistakes and all(fault.size is None for fault in right_answers.mistakes):
+    if right_answers.mistakes and all(fault.size is None for fault in right_answers.mistakes):
         # no injected fault has a size: the points for sizes are given for the right fault names
         points["mistakes"] += weights["sizes"] * scores["mistakes"]
-    deduction = FALSE_FAULT_DEDUCTION * len(wrongly_named_faults)
+    deduction = flight_fraction * FALSE_FAULT_DEDUCTION * len(wrongly_named_faults)
     points["mistakes"] = max(points["mistakes"] - deduction, 0.0)
     if right_answers.choices:
-        weights, points = (
-            {name: POINTS_FRACTION_OF_FLIGHT_QUESTIONS * value for name, value in values.items()}
-            for values in (weights, points)
-        )
-        weights["figures"] = 100.0 * (1.0 - POINTS_FRACTION_OF_FLIGHT_QUESTIONS)
+        weights["figures"] = 100.0 * (1.0 - flight_fraction)
         points["figures"] = weights["figures"] * _score_choices(answers, right_answers)
     kinds_named_by_student = [named_fault.kind for named_fault in answers.mistakes]
     feedback = (
@@ -176,7 +181,7 @@ def describe_right_answer(fault: InjectedFault) -> str:
     """State the accepted size and the time of a fault, and the plots that show the fault."""
     texts = []
     if fault.low is not None and fault.high is not None:
-        unit = next(iter(FAULT_KINDS[fault.kind].units), "")
+        unit = FAULT_KINDS[fault.kind].standard_unit
         texts.append(f"accepted fault size {fault.low:.3g} to {fault.high:.3g} {unit}".rstrip())
     start_text = "" if fault.from_s is None else f"from {fault.from_s:.0f} s "
     end_text = "" if fault.until_s is None else f"until {fault.until_s:.0f} s"
@@ -186,6 +191,7 @@ def describe_right_answer(fault: InjectedFault) -> str:
 
 def _describe_wrong_answers(answers: Answers, right_answers: CorrectFormAnswers) -> Iterator[str]:
     """Yield feedback on wrong answers about consistency, EKF2, numbers and figures."""
+    # question, answer of the student, and right answer
     rows: list[tuple[str, object, object]] = [
         ("consistency of KF", answers.verdict_kf, right_answers.kf.verdict or NOT_AVAILABLE),
         ("consistency of EKF2", answers.verdict_ekf2, right_answers.ekf2.verdict or NOT_AVAILABLE),
@@ -198,14 +204,29 @@ def _describe_wrong_answers(answers: Answers, right_answers: CorrectFormAnswers)
     ):
         if right not in (None, ()) and _score_number(given, right) < 1.0:
             rows.append((f"{question.text}, {tolerance_text}", given, right))
-    for letter, (choice, right_letter) in zip_longest(
-        answers.choices[: len(right_answers.choices)], right_answers.choices
-    ):
-        given_text = choice.answer_text(letter) if letter else ""
-        rows.append((choice.question, given_text, choice.answer_text(right_letter)))
+    for choice, right_letter, letter in list_answered_choices(answers, right_answers):
+        rows.append((choice.question, choice.answer_text(letter), choice.answer_text(right_letter)))
     for name, given, right in rows:
         if given != right:
             yield f"{name}: {_format_answer(right)} is right, you gave {_format_answer(given)}"
+
+
+class AnsweredChoice(NamedTuple):
+    """Multiple-choice question, and the letter that the student gave ("" if left blank)."""
+
+    choice: Choice
+    right_letter: str
+    letter: str
+
+
+def list_answered_choices(
+    answers: Answers, right_answers: CorrectFormAnswers
+) -> list[AnsweredChoice]:
+    letters = (*answers.choices, *[""] * len(right_answers.choices))
+    return [
+        AnsweredChoice(choice, right_letter, letter)
+        for (choice, right_letter), letter in zip(right_answers.choices, letters, strict=False)
+    ]
 
 
 def _format_answer(answer: object) -> str:
@@ -221,23 +242,24 @@ def _match_faults(
 
     Return the matches, and the named faults that match no injected fault.
     """
-    wrongly_named_faults = [
+    unmatched_faults = [
         named_fault for named_fault in answers.mistakes if named_fault.kind != NO_FAULT_KIND
     ]
-    match_by_kind: dict[str, tuple[NamedFault, float]] = {}
     candidates = [
         (score_fault_kind(fault.kind, named_fault.kind), fault.kind, named_fault)
         for fault in right_answers.mistakes
-        for named_fault in wrongly_named_faults
+        for named_fault in unmatched_faults
     ]
-    for score, kind, named_fault in sorted(candidates, key=lambda each: -each[0]):
-        if score and kind not in match_by_kind and named_fault in wrongly_named_faults:
+    match_by_kind: dict[str, tuple[NamedFault, float]] = {}
+    # match the pairs with the highest scores first; each fault belongs to at most one pair
+    for score, kind, named_fault in sorted(candidates, key=itemgetter(0), reverse=True):
+        if score and kind not in match_by_kind and named_fault in unmatched_faults:
             match_by_kind[kind] = named_fault, score
-            wrongly_named_faults.remove(named_fault)
+            unmatched_faults.remove(named_fault)
     matches = [
         (fault, *match_by_kind.get(fault.kind, (None, 0.0))) for fault in right_answers.mistakes
     ]
-    return matches, wrongly_named_faults
+    return matches, unmatched_faults
 
 
 def score_fault_kind(kind: str, named_kind: str) -> float:
@@ -248,19 +270,24 @@ def score_fault_kind(kind: str, named_kind: str) -> float:
         return SCORE_FOR_WRONG_NOISE_PARAMETER
     if any({kind, named_kind} <= group for group in SIMILAR_FAULT_GROUPS):
         return SCORE_FOR_SIMILAR_FAULT
-    is_consequence = named_kind in POINTS_CONFIG["effects"].get(kind, ())
+    is_consequence = named_kind in POINTS_CONFIG["effects"].get(kind, "").split()
     return SCORE_FOR_NAMED_CONSEQUENCE if is_consequence else 0.0
 
 
 def _score_faults(matches: list[FaultMatch], right_answers: CorrectFormAnswers) -> dict[str, float]:
-    """Return the mean score of all injected faults, by part of the answer form."""
+    """Return the mean score of all injected faults, by part of the answer form.
+
+    The score for sizes is the mean of the faults with a size.
+    """
     faults_with_size_count = sum(fault.size is not None for fault, _, _ in matches)
     scores = dict.fromkeys(("mistakes", "sizes", "fault time and plot", "correction"), 0.0)
     for fault, named_fault, score in matches:
         if named_fault is None:
             continue
         size_score = score_fault_size(fault, named_fault)
+        # time, plot and correction of a guessable fault are easy: they need the right size
         fault_weight = (size_score if fault.kind in GUESSABLE_FAULT_KINDS else 1.0) / len(matches)
+        # time and plot of a similar fault give half of the points
         evidence_weight = fault_weight if named_fault.kind == fault.kind else 0.5 * fault_weight
         scores["mistakes"] += score / len(matches)
         scores["fault time and plot"] += score_evidence(fault, named_fault) * evidence_weight
@@ -275,14 +302,17 @@ def score_fault_size(fault: InjectedFault, named_fault: NamedFault) -> float:
     if fault.size is None or fault.low is None or fault.high is None or stated_size is None:
         return 0.0
     if named_fault.kind != fault.kind:
-        units = [[*FAULT_KINDS[kind].units][:1] for kind in (named_fault.kind, fault.kind)]
-        is_size_right = fault.low <= stated_size <= fault.high and units[0] == units[1]
-        return is_size_right / 3.0
+        # the right size of a similar fault, such as a time offset, gives a third of the points
+        unit, named_unit = (FAULT_KINDS[each.kind].standard_unit for each in (fault, named_fault))
+        return (fault.low <= stated_size <= fault.high and unit == named_unit) / 3.0
     relative_error = abs(stated_size - fault.size) / abs(fault.size)
-    score_outside_range = 0.5 * (relative_error <= MAX_RELATIVE_SIZE_ERROR_FOR_HALF_POINTS)
     if fault.kind in GUESSABLE_FAULT_KINDS:
-        excess_error = relative_error - (fault.high - fault.low) / (2.0 * abs(fault.size))
+        # the score decreases linearly with the distance from the accepted range
+        tolerance = (fault.high - fault.low) / (2.0 * abs(fault.size))
+        excess_error = relative_error - tolerance
         score_outside_range = max(1.0 - excess_error / EXCESS_SIZE_ERROR_AT_ZERO_POINTS, 0.0)
+    else:
+        score_outside_range = 0.5 * (relative_error <= MAX_RELATIVE_SIZE_ERROR_FOR_HALF_POINTS)
     return _score_number_in_range(stated_size, fault.low, fault.high, score_outside_range)
 
 
@@ -307,7 +337,7 @@ def score_evidence(fault: InjectedFault, named_fault: NamedFault) -> float:
 
 def find_panels_showing_fault(fault_kind: str) -> list[str]:
     return [
-        *(panel for panel, kinds in POINTS_CONFIG["shows"].items() if fault_kind in kinds),
+        *(panel for panel, kinds in POINTS_CONFIG["shows"].items() if fault_kind in kinds.split()),
         "cover",
     ]
 
@@ -347,14 +377,19 @@ def find_accepted_corrections(
     size, lower_bound, upper_bound = (value or 0.0 for value in (fault.size, fault.low, fault.high))
     fault_start_s = fault.from_s or 0.0
     fault_end_s = fault_start_s if fault.until_s is None else fault.until_s
+    # ranges that the column right_values of corrections.csv names
     range_by_name = {
         "": NO_BOUNDS,
         "negated": (-upper_bound, -lower_bound),
         "size": (lower_bound, upper_bound),
         "late milliseconds": (1e3 * lower_bound, 1e3 * upper_bound),
+        # at least twice the injected value
         "twice": (2.0 * size, 1e4),
+        # factors on the distances that correct a scale error in per cent
         "factors": (100.0 / (100.0 + upper_bound), 100.0 / (100.0 + lower_bound)),
+        # true noise, with the limits of the verdict "consistent"
         "noise": (0.8 * right_answers.sigma_z_m, 1.25 * right_answers.sigma_z_m),
+        # analysis that begins after the fault, or ends before the fault: up to 15 s are lost
         "after": (fault_end_s - 1.0, fault_end_s + 15.0),
         "before": (fault_start_s - 15.0, fault_start_s + 1.0),
     }
@@ -363,9 +398,10 @@ def find_accepted_corrections(
         # EKF2_EV_DELAY cannot be negative, so it does not correct timestamps that are too early
         is_possible = size > 0.0 or rule.right_values != "late milliseconds"
         if fault.kind in rule.fault_kinds.split() and is_possible:
-            low, high = range_by_name.get(rule.right_values) or map(
-                float, rule.right_values.split(" to ")
-            )
+            if rule.right_values in range_by_name:
+                low, high = range_by_name[rule.right_values]
+            else:
+                low, high = map(float, rule.right_values.split(" to "))
             accepted_corrections.append((rule.parameter, (low, high), rule.score))
     return accepted_corrections
 
@@ -393,7 +429,7 @@ def _score_ekf2_behaviour(answers: Answers, right_answers: CorrectFormAnswers) -
 def _score_choices(answers: Answers, right_answers: CorrectFormAnswers) -> float:
     """Return the mean score of the multiple-choice questions; random answers give 0 on average."""
     points = 0.0
-    for letter, (_, right_letter) in zip(answers.choices, right_answers.choices, strict=False):
+    for _, right_letter, letter in list_answered_choices(answers, right_answers):
         if letter:
             points += 1.0 if letter == right_letter else -1.0 / (len(CHOICE_LETTERS) - 1)
     return points / len(right_answers.choices)

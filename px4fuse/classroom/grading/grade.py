@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -136,7 +136,7 @@ def grade(
             report_by_index[index] = replace(report, submission=submission.name, student=student)
             progress(len(report_by_index), len(found_submissions))
     grades, override_notes = build_grades(
-        [report_by_index[index] for index in range(len(found_submissions))],
+        [report for _, report in sorted(report_by_index.items())],
         found_submissions,
         course,
         overrides,
@@ -242,39 +242,50 @@ def load_or_verify(
     ResultsError
         The file is not a report.
     """
-    sha256 = hashlib.sha256(pdf).hexdigest()
-    collect_versions_and_files = partial(
-        _collect_versions_and_files, path_by_sha256, assigned_hashes
-    )
-    # the report is verified again if the earlier result is unreadable or has other inputs
-    with suppress(OSError, msgspec.MsgspecError, ResultsError):
-        content = (records_folder / f"{sha256}.json").read_bytes()
-        record = msgspec.json.decode(content, type=VerificationRecord)
-        loaded_results = read_results(record.results.encode())
-        if record.versions_and_files == collect_versions_and_files(record.results) and isinstance(
-            loaded_results, ReportedResults
-        ):
-            return loaded_results, record.verification, True
+    record_path = records_folder / hashlib.sha256(pdf).hexdigest()
+    loaded = _load_verification(record_path, path_by_sha256, assigned_hashes)
+    if loaded is not None:
+        return (*loaded, True)
     results = read_report(pdf, "The file")
-    versions_and_files = collect_versions_and_files(to_json(results))
+    versions_and_files = _collect_versions_and_files(
+        to_json(results), path_by_sha256, assigned_hashes
+    )
     # the report is about an assigned log that was not given to this command. Without any log,
     # verify() returns "cannot verify" instead of "other log", which would be the student's fault
     is_log_missing = versions_and_files.get(log_sha256(results)) == "assigned"
     verification = verify(results, pdf, {} if is_log_missing else path_by_sha256)
-    files = {REDRAWN_REPORT_SUFFIX: verification.redrawn_pdf} if verification.redrawn_pdf else {}
+    files = {REDRAWN_REPORT_SUFFIX: verification.redrawn_pdf}
     if verification.status == "verified" and log_sha256(results) in assigned_hashes:
         results, files[DIAGNOSIS_SUFFIX] = repeat_analysis_with_diagnosis(results, path_by_sha256)
-    stored_verification = replace(verification, redrawn_pdf=b"")
-    record = VerificationRecord(versions_and_files, to_json(results), stored_verification)
-    for old_file in records_folder.glob(f"{sha256}.*"):
-        # keep the JSON file: another process may read it if two students handed in the same PDF
-        if old_file.suffix != ".json":
-            old_file.unlink(missing_ok=True)
+    verification = replace(verification, redrawn_pdf=b"")
+    record = VerificationRecord(versions_and_files, to_json(results), verification)
     files[".json"] = msgspec.json.encode(record)
+    # delete PDFs of an earlier verification; the JSON file is replaced, because another process may
+    # read it if two students handed in the same PDF
+    for suffix in (REDRAWN_REPORT_SUFFIX, DIAGNOSIS_SUFFIX):
+        record_path.with_suffix(suffix).unlink(missing_ok=True)
     write_output_files(
-        {records_folder / f"{sha256}{suffix}": content for suffix, content in files.items()}
+        {record_path.with_suffix(suffix): content for suffix, content in files.items() if content}
     )
-    return results, stored_verification, False
+    return results, verification, False
+
+
+def _load_verification(
+    record_path: Path, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
+) -> tuple[ReportedResults, Verification] | None:
+    """Load an earlier verification; None if it is missing, unreadable or had other inputs."""
+    try:
+        content = record_path.with_suffix(".json").read_bytes()
+        record = msgspec.json.decode(content, type=VerificationRecord)
+        results = read_results(record.results.encode())
+    except (OSError, ValueError, ResultsError):
+        return None
+    versions_and_files = _collect_versions_and_files(
+        record.results, path_by_sha256, assigned_hashes
+    )
+    if record.versions_and_files != versions_and_files or not isinstance(results, ReportedResults):
+        return None
+    return results, record.verification
 
 
 def repeat_analysis_with_diagnosis(
@@ -296,7 +307,7 @@ def repeat_analysis_with_diagnosis(
 
 
 def _collect_versions_and_files(
-    path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str], results: str
+    results: str, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
 ) -> dict[str, str]:
     """Return the versions of libraries, and the availability of input files by SHA-256."""
     versions = provenance("")

@@ -2,10 +2,13 @@
 
 import textwrap
 from collections.abc import Iterator, Sequence
-from itertools import zip_longest
 
 from px4fuse.classroom.assignment.key import AnswerKey, CorrectFormAnswers
-from px4fuse.classroom.grading.form_points import describe_right_answer, find_panels_showing_fault
+from px4fuse.classroom.grading.form_points import (
+    describe_right_answer,
+    find_panels_showing_fault,
+    list_answered_choices,
+)
 from px4fuse.classroom.grading.model import Grade
 from px4fuse.core.text import one_line
 from px4fuse.results.answer_form import FAULT_KINDS, NO_FAULT_KIND, REPORT_PANELS, Answers
@@ -49,10 +52,7 @@ def ask_about_form(
                 f"Injected fault of the flight: {', '.join(injected_fault_kinds) or 'no fault'}.",
             )
     for fault in right_answers.mistakes:
-        description, panels = (
-            FAULT_KINDS[fault.kind].description,
-            find_panels_showing_fault(fault.kind),
-        )
+        description = FAULT_KINDS[fault.kind].description
         if fault.kind not in kinds_named_by_student:
             yield (
                 f"Your flight also has this fault: {description}. Show this fault in a plot of "
@@ -60,6 +60,7 @@ def ask_about_form(
                 f"{describe_right_answer(fault)}.",
             )
             continue
+        panels = find_panels_showing_fault(fault.kind)
         other_panels = [panel for panel in REPORT_PANELS if panel not in panels]
         yield (
             f"You named {fault.kind} ({description}). Show this fault in a plot of your report. "
@@ -67,9 +68,12 @@ def ask_about_form(
             f"{describe_right_answer(fault)}. Examples of plots that cannot show {fault.kind}: "
             f"{' or '.join(other_panels[:2])}.",
         )
-    questions = zip_longest(right_answers.choices, answers.choices[: len(right_answers.choices)])
-    for (choice, right_letter), letter in sorted(questions, key=lambda each: each[0][1] == each[1]):
-        answer_text = choice.answer_text(letter) if letter else "none"
+    wrong_answers_first = sorted(
+        list_answered_choices(answers, right_answers),
+        key=lambda each: each.letter == each.right_letter,
+    )
+    for choice, right_letter, letter in wrong_answers_first:
+        answer_text = choice.answer_text(letter) or "none"
         yield (
             f"{choice.question}. Your answer: {answer_text}. Explain this answer with the figure.",
             f"Right: {choice.answer_text(right_letter)}.",

@@ -388,11 +388,13 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
     """
     titles = sheet.column_titles
     short_titles = [_ASSIGNMENT_NUMBER_PATTERN.sub("", title) for title in titles]
+    # Canvas marks the columns that it computes in one of the first rows
     editable_indices = [
         index
         for index in range(len(titles))
         if not any(READ_ONLY_TEXT in row[index] for row in sheet.rows[:3])
     ]
+    # Canvas adds the number of the assignment to the title of its column
     assignment_indices = [
         index for index in editable_indices if short_titles[index] != titles[index]
     ]
@@ -401,12 +403,16 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
         for index in editable_indices
         if normalise_text(column_title) in map(normalise_text, (titles[index], short_titles[index]))
     ]
-    grade_column_index = sheet.find_column_index(GRADE_COLUMN_TITLES)
-    candidate_indices = assignment_indices if grade_column_index is None else [grade_column_index]
     # a table of Moodle (with a column "identifier") has only one grade column, so a --column that
     # matches none of its columns refers to another table
-    if column_title and (matching_indices or sheet.find_column_index(("identifier",)) is None):
+    is_moodle_table = sheet.find_column_index(("identifier",)) is not None
+    grade_column_index = sheet.find_column_index(GRADE_COLUMN_TITLES)
+    if column_title and (matching_indices or not is_moodle_table):
         candidate_indices = matching_indices
+    elif grade_column_index is not None:
+        candidate_indices = [grade_column_index]
+    else:
+        candidate_indices = assignment_indices
     if len(candidate_indices) == 1:
         return candidate_indices[0]
     problem = "several grade columns" if candidate_indices else "no grade column was found"
@@ -466,21 +472,23 @@ def fill_grades(
         if student_index is None:
             continue
         matched_student_indices.add(student_index)
-        total_points = (grade := grades[student_index]).total
-        if total_points is None:
+        grade, name = grades[student_index], names[student_index]
+        points = grade.total
+        if points is None:  # the cell is not changed
             continue
         if platform_max_points is not None and grade.max_points:
-            total_points = round(total_points * platform_max_points / grade.max_points, 2)
+            points = round(points * platform_max_points / grade.max_points, 2)
         max_points = _find_max_points(sheet, row, grade_column_index)
-        if max_points is not None and total_points > max_points:
+        if max_points is not None and points > max_points:
             notes.append(
-                f"{sheet.path.name}: {names[student_index]} has {total_points:.10g} points, above "
+                f"{sheet.path.name}: {name} has {points:.10g} points, above "
                 f"the maximum of {max_points:.10g} in the table. Increase the maximum on the "
                 f"learning platform, or run grade again with --scale {max_points:.10g}."
             )
-        row[grade_column_index] = format_cell_number(total_points).replace(
-            ".", "," if has_decimal_comma else "."
-        )
+        points_text = format_cell_number(points)
+        if has_decimal_comma:
+            points_text = points_text.replace(".", ",")
+        row[grade_column_index] = points_text
         if feedback_column_index is not None and feedback_column_index != grade_column_index:
             row[feedback_column_index] = format_feedback(feedback_texts[student_index])
     missing_names = [

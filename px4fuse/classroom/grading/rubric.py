@@ -11,6 +11,7 @@ import re
 import tomllib
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Union
@@ -157,54 +158,29 @@ def score_report(
     ``submitter_id`` is the student id on the learning platform.
     """
     scoring_input = ScoringInput(results, verification, key, submitter_id)
-    student, command = results.student, "loop" if isinstance(results, LoopResults) else "compare"
+    student, values = results.student, scoring_input.values
     problems = [*_find_problems(scoring_input, rubric)]
     zero_points_reasons = [reason for rule, reason, _ in problems if rule == "zero"]
-    graded_items = []
-    for item in rubric.items:
-        if not item.is_applicable(command, key):
-            continue
-        is_awaiting_points = item.is_scored_by_instructor and bool(student.notes.strip())
-        fraction, comment = item.score(scoring_input)
-        if zero_points_reasons:
-            fraction, comment = 0.0, f"No points: {zero_points_reasons[0]}."
-            is_awaiting_points = False
-        points = round(item.points * fraction, 2)
-        graded_items.append(
-            ItemScore(
-                item.title,
-                points,
-                item.points,
-                comment,
-                item.is_scored_by_instructor,
-                is_awaiting_points,
-            )
-        )
-    form_points_or_reason, values = scoring_input.form_points, scoring_input.values
-    if isinstance(form_points_or_reason, str) or not scoring_input.is_own_log:
-        form_points_or_reason = FormPoints()
     pending_actions = [action for rule, _, action in problems if rule == "pending"]
-    flags = []
-    if verification.pages:
-        flags.append(
-            "The PDF differs from the report that px4fuse recomputed from the log. "
-            f"{capitalise_first(verification.pages[0].sentence)}."
-        )
-    flags += flag_settings(results)
-    if not scoring_input.is_own_log:
-        flags.append(_make_other_students_log_advice(scoring_input))
-    if scoring_input.has_form_of_other_log:
-        flags.append(FORM_MISMATCH_ADVICE)
+    items = [*_score_items(scoring_input, rubric)]
+    if zero_points_reasons:
+        comment, pending_actions = f"No points: {zero_points_reasons[0]}.", []
+        items = [
+            replace(item, points=0.0, comment=comment, is_awaiting_points=False) for item in items
+        ]
+    form_points = scoring_input.form_points
+    if isinstance(form_points, str) or not scoring_input.is_own_log:
+        form_points = FormPoints()
     return GradedReport(
         "",
         student.name,
         student.id,
         verification,
-        tuple(graded_items),
-        flags=tuple(flags),
-        instructor_action="" if zero_points_reasons else " ".join(pending_actions),
-        did_student_name_fault=form_points_or_reason.did_student_name_fault,
-        form_part_scores=form_points_or_reason.parts,
+        tuple(items),
+        flags=tuple(_flag_report(scoring_input)),
+        instructor_action=" ".join(pending_actions),
+        did_student_name_fault=form_points.did_student_name_fault,
+        form_part_scores=form_points.parts,
         form=scoring_input.form if isinstance(scoring_input.form, Answers) else None,
         numbers={
             title: float(values[path]) for title, path in CLASS_TABLE_NUMBERS if path in values
@@ -213,6 +189,36 @@ def score_report(
         version=results.provenance.px4fuse,
         notes=student.notes,
     )
+
+
+def _score_items(scoring_input: ScoringInput, rubric: Rubric) -> Iterator[ItemScore]:
+    command = "loop" if isinstance(scoring_input.results, LoopResults) else "compare"
+    has_text = bool(scoring_input.results.student.notes.strip())
+    for item in rubric.items:
+        if item.is_applicable(command, scoring_input.key):
+            fraction, comment = item.score(scoring_input)
+            yield ItemScore(
+                item.title,
+                round(item.points * fraction, 2),
+                item.points,
+                comment,
+                item.is_scored_by_instructor,
+                item.is_scored_by_instructor and has_text,
+            )
+
+
+def _flag_report(scoring_input: ScoringInput) -> Iterator[str]:
+    page_differences = scoring_input.verification.pages
+    if page_differences:
+        yield (
+            "The PDF differs from the report that px4fuse recomputed from the log. "
+            f"{capitalise_first(page_differences[0].sentence)}."
+        )
+    yield from flag_settings(scoring_input.results)
+    if not scoring_input.is_own_log:
+        yield _make_other_students_log_advice(scoring_input)
+    if scoring_input.has_form_of_other_log:
+        yield FORM_MISMATCH_ADVICE
 
 
 def _find_problems(

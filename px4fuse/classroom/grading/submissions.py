@@ -160,23 +160,24 @@ def add_submitters(
 
     ``origin_by_submission_number`` contains students and times from the metadata of Gradescope.
     """
-    export_names = [
+    # files of one export are in the same zip file, or in the same folder
+    exports = [
         submission.file if submission.zip_entry else submission.name.partition("/")[0]
         for submission in submissions
     ]
     platform_counts_by_export: dict[object, Counter[str]] = defaultdict(Counter)
-    for export_name, submission in zip(export_names, submissions, strict=True):
+    for export, submission in zip(exports, submissions, strict=True):
         if platform := parse_submission_path(submission.name).platform:
-            platform_counts_by_export[export_name][platform] += 1
-    for export_name, submission in zip(export_names, submissions, strict=True):
-        most_common = platform_counts_by_export[export_name].most_common(1)
+            platform_counts_by_export[export][platform] += 1
+    for export, submission in zip(exports, submissions, strict=True):
+        # one platform wrote all names of an export, but students may imitate another platform
+        most_common = platform_counts_by_export[export].most_common(1)
         origin = parse_submission_path(submission.name, [platform for platform, _ in most_common])
         if origin.platform in ("gradescope", ""):
             # Gradescope exports PDFs as SUBMISSION_NUMBER.pdf
             stem = submission.name.rpartition("/")[2].casefold().removesuffix(".pdf")
-            origin = origin_by_submission_number.get(
-                origin.person.numbers.get("gradescope", stem), origin
-            )
+            number = origin.person.numbers.get("gradescope", stem)
+            origin = origin_by_submission_number.get(number, origin)
         yield replace(submission, origin=origin)
 
 
@@ -352,31 +353,35 @@ def parse_submission_path(
     >>> parse_submission_path("report.pdf") == ExportOrigin()
     True
     """
-    remaining_path = name
-    while remaining_path:
-        for platform in platforms:
-            match = PATH_PATTERN_BY_PLATFORM[platform].match(remaining_path)
-            if match is None:
-                continue
-            matched_fields = {key: value or "" for key, value in match.groupdict().items()}
-            time_text = matched_fields.get("time", "")
+    for platform, match in _match_platforms(name, platforms):
+        fields = match.groupdict("")
+        time = None
+        if time_text := fields.get("time"):
             try:
-                time = datetime.strptime(time_text, BLACKBOARD_TIME_FORMAT) if time_text else None
+                time = datetime.strptime(time_text, BLACKBOARD_TIME_FORMAT)
             except ValueError:  # platforms write only valid times: the student chose this name
                 continue
-            person_names = (matched_fields.get(key) for key in ("name", "first", "last"))
-            numbers = {platform: matched_fields["number"]} if "number" in matched_fields else {}
-            full_name, login = " ".join(filter(None, person_names)), matched_fields.get("login", "")
-            person = Person("", full_name, "", login, numbers)
-            # Moodle and Blackboard add this text once to each path
-            has_forged_platform_name = len(_PLATFORM_TEXT_PATTERN.findall(name)) > (
-                platform in ("moodle", "blackboard")
-            )
-            return ExportOrigin(
-                platform, person, time, bool(matched_fields.get("late")), has_forged_platform_name
-            )
-        remaining_path = remaining_path.partition("/")[2]
+        full_name = " ".join(filter(None, map(fields.get, ("name", "first", "last"))))
+        numbers = {platform: fields["number"]} if "number" in fields else {}
+        # Moodle and Blackboard add this text once to each path
+        platform_text_count = 1 if platform in ("moodle", "blackboard") else 0
+        return ExportOrigin(
+            platform,
+            Person("", full_name, "", fields.get("login", ""), numbers),
+            time,
+            bool(fields.get("late")),
+            len(_PLATFORM_TEXT_PATTERN.findall(name)) > platform_text_count,
+        )
     return UNKNOWN_ORIGIN
+
+
+def _match_platforms(name: str, platforms: Iterable[str]) -> Iterator[tuple[str, re.Match[str]]]:
+    """Yield platforms with matches of their patterns, from the beginning of a path to its end."""
+    while name:
+        for platform in platforms:
+            if match := PATH_PATTERN_BY_PLATFORM[platform].match(name):
+                yield platform, match
+        name = name.partition("/")[2]
 
 
 def read_gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
