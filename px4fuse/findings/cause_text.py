@@ -179,5 +179,5 @@ def _format_one_change(analysis: Analysis, cause: Rerun, name: str) -> str:
             return f"{label} {value:.2g} {unit} instead of {getattr(settings, name):g} {unit}"
     assert not isinstance(analysis.ekf2_model, Unavailable)
     used_value, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].printed_unit
-    text = f"{name} {value:.3g} {unit} instead of {used_value:.4g} {unit}"
-    return text.replace("  ", " ").rstrip()
+    unit_text = f" {unit}" if unit else ""
+    return f"{name} {value:.3g}{unit_text} instead of {used_value:.4g}{unit_text}"

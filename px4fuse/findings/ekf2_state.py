@@ -192,6 +192,8 @@ def detect_missing_alignment(
     if not fuses_source_yaw:
         heading_action = _find_heading_action(flight, source)
         quantities.append(("yaw_align", "heading", heading_action))
+    # EKF2 aligns the heading after the tilt, so the time until tilt alignment is not the fault of
+    # the heading
     alignment_end_s = segment.start_s
     for flag, quantity, action in quantities:
         if flag not in ekf2.status_flags:
@@ -234,7 +236,8 @@ def _find_heading_action(flight: Flight, source: PositionTrack | None) -> str:
 def detect_resets(analysis: Analysis, ekf2: Ekf2) -> Findings:
     """Detect resets of EKF2's position and height, except normal ones at take-off."""
     segment = analysis.segment.whole_flight
-    # Resets up to the start of fusion are normal
+    # Resets up to the start of fusion are normal. If the log shows that EKF2 never fused positions,
+    # this time is NaN, and every reset counts
     fusion_start_s = -math.inf
     if isinstance(ekf2.fusion_flags, pd.DataFrame):
         is_fused = ekf2.fusion_flags["horizontal"] > 0.0
@@ -251,6 +254,7 @@ def detect_resets(analysis: Analysis, ekf2: Ekf2) -> Findings:
     if position_resets:
         horizontal_resets = [reset for reset in position_resets if any(reset.delta[:2])]
         resets = horizontal_resets or position_resets
+        # True if each reset follows a gap in the positions
         follows_gap = all(
             any(
                 start <= reset.time_s <= end + MAX_RESET_DELAY_S

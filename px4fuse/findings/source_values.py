@@ -100,9 +100,11 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
         spans = tuple(zip(times_by_span.min().tolist(), times_by_span.max().tolist(), strict=True))
         start_s, end_s = max(spans, key=lambda span: span[1] - span[0])
         total_s = sum(end - start for start, end in spans)
-        error_text, make_finding = "", make_note if reason == "NaN" else make_warning
-        if end_s - start_s > compute_max_interval_s(1.0 / source.compute_rate_hz()):
-            make_finding = make_warning
+        # Single NaN are a usual way to send that a position is unknown
+        is_long = end_s - start_s > compute_max_interval_s(1.0 / source.compute_rate_hz())
+        make_finding = make_note if reason == "NaN" and not is_long else make_warning
+        error_text = ""
+        if is_long:
             # Last position before the span, and first position after it
             valid_times_s = analysis.input_axes[0].measurement_time_s
             first, last = np.clip(
@@ -169,23 +171,23 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
         MIN_ROTATION_DEG, MIN_ROTATION_SIGMAS * lever_arm.rotation_sigma_deg
     ):
         rotation_deg = 0.0
-    sensor_text, action = f"{source.kind_name} sensor", f"Set {format_changes(change)}."
-    error_text = "the position error"
+    # The position of the sensor or that of the IMU is wrong. If replays are possible, they decide
     effect_sentence = _describe_replayed_effect(analysis, change, rotation_deg)
-    # The new lever arm of the sensor hardly reduces EKF2's error against ground truth: test another
-    # position of the IMU
-    if effect_sentence is None:
+    if effect_sentence is not None:
+        sensor_text, error_text = f"{source.kind_name} sensor", "the position error"
+        action = f"Set {format_changes(change)}."
+        if any(imu_position_m) and not has_truth:
+            action += (
+                " If the sensor position parameters are right, the IMU position is wrong: set "
+                f"{format_changes(imu_position_change)} instead."
+            )
+    else:
         effect_sentence = _describe_replayed_effect(analysis, imu_position_change, rotation_deg)
-        sensor_text, action = "IMU", f"Set {format_changes(imu_position_change)}."
-        error_text = "EKF2's position error"
+        if effect_sentence is None:
+            return
+        sensor_text, error_text = "IMU", "EKF2's position error"
+        action = f"Set {format_changes(imu_position_change)}."
         forward_m, right_m = 0.0 - forward_m, 0.0 - right_m
-    elif any(imu_position_m) and not has_truth:
-        action += (
-            " If the sensor position parameters are right, the IMU position is wrong: set "
-            f"{format_changes(imu_position_change)} instead."
-        )
-    if effect_sentence is None:
-        return
     if source.alignment is not None:  # no EKF2 parameter corrects positions of a file
         sensor_text = "sensor"
         action = "Subtract this lever arm, rotated to NED by the attitude, from the positions."
@@ -226,6 +228,7 @@ def _describe_replayed_effect(
         return ""
     rmses_m, ekf2_model = [], misalign_positions(ekf2_model, -rotation_deg, 0.0)
     changed_model = ekf2_model
+    # The model does not take the position of the IMU from the parameters: move the IMU instead
     if change.keys() <= {*IMU_POSITION_PARAMETERS}:
         inputs = ekf2_model.inputs
         imu_offset_m = np.array([*change.values(), inputs.imu_offset_m[2]])
@@ -257,15 +260,19 @@ def detect_two_senders(analysis: Analysis) -> Findings:
         return
     time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
     weight = ((time_s[1:-1] - time_s[:-2]) / (time_s[2:] - time_s[:-2]))[:, None]
+    # Deviation of each position from the line through the previous and the next position. With two
+    # senders, it alternates between ± their distance: invert every other deviation
     deviations_m = position_m[1:-1] - (1.0 - weight) * position_m[:-2] - weight * position_m[2:]
     deviations_m[::2] *= -1.0
     windows_m = deviations_m[: window_count * WINDOW_SAMPLES].reshape(
         window_count, WINDOW_SAMPLES, -1
     )
     medians_m = np.median(windows_m, axis=1)
+    # A lost sample inverts the later medians: give all the direction of the largest
     largest_median_m = medians_m[np.argmax(np.linalg.norm(medians_m, axis=1))]
     medians_m[medians_m @ largest_median_m < 0.0] *= -1.0
     difference_between_senders_m = np.median(medians_m, axis=0)
+    # σ from the median absolute deviation
     scatter_m = 1.4826 * np.median(np.abs(medians_m - difference_between_senders_m), axis=0).max()
     distance_m = float(np.linalg.norm(difference_between_senders_m))
     if distance_m < max(MIN_SENDER_DISTANCE_M, MIN_SENDER_DISTANCE_SIGMAS * scatter_m):
