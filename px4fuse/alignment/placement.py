@@ -137,10 +137,10 @@ def align_position_file(
         An omitted option cannot be estimated, or file and log do not overlap in time.
     """
     _check_options(frame, yaw_deg, clock_offset_s)
-    samples = select_valid_rows(recording.samples, ["x_m", "y_m"])
+    samples, name = select_valid_rows(recording.samples, ["x_m", "y_m"]), recording.name
     if len(samples) < MIN_MATCHED_SAMPLES:
         raise MissingDataError(
-            f"{recording.name} contains {len(samples)} positions; {MIN_MATCHED_SAMPLES} are needed",
+            f"{name} contains {len(samples)} positions; {MIN_MATCHED_SAMPLES} are needed",
             "Check that the position file contains the whole flight.",
         )
     start_s, end_s = samples.index[[0, -1]].tolist()
@@ -154,7 +154,7 @@ def align_position_file(
     lag_s = None if clock_offset_s is None else start_s + clock_offset_s - boot_time_s
     if lag_s is not None and not start_s - end_s <= lag_s <= duration_s:
         raise MissingDataError(
-            f"{recording.name}: with --clock-offset {clock_offset_s:.3f} the file does not "
+            f"{name}: with --clock-offset {clock_offset_s:.3f} the file does not "
             f"overlap the log ({spans_text})",
             "Correct or omit --clock-offset.",
         )
@@ -164,9 +164,9 @@ def align_position_file(
         match = find_match(flight, problem)
     except NoMatchError as error:
         if fault := _explain_mismatch(flight, problem, recording.metres_per_unit):
-            raise MissingDataError(f"{recording.name}: {fault[0]}.", fault[1]) from None
+            raise MissingDataError(f"{name}: {fault[0]}.", fault[1]) from None
         raise MissingDataError(
-            f"{recording.name}: {error.reason}; {spans_text}", f"{error.remedy}."
+            f"{name}: {error.reason}; {spans_text}", f"{error.remedy}."
         ) from None
     if frame:
         frame_reason = "the frame was given with --position-frame"
@@ -193,7 +193,7 @@ def align_position_file(
         recording.clock_kind, sample_count + recording.dropped_row_count, sample_count
     )
     track = PositionTrack(
-        name=recording.name,
+        name=name,
         origin=POSITION_FILE_ORIGIN,
         description=f"position file with {len(aligned_samples)} samples in the frame "
         f"{alignment.frame}{rotation_text}",
@@ -201,8 +201,8 @@ def align_position_file(
         frame="NED",
         clock=f"{recording.clock_kind} clock of the position file; boot clock minus this clock: "
         f"{alignment.clock_offset_s:+.3f} s ({offset_method})",
-        topics=(recording.name,),
-        log=recording.name,
+        topics=(name,),
+        log=name,
         alignment=alignment,
         clock_map=clock_map,
         invalid_reasons=invalid_reasons.set_axis(
@@ -210,19 +210,16 @@ def align_position_file(
         ),
         quantisation_step_m=recording.quantisation_step_m,
     )
-    notes = [
-        f"{recording.name}: {text}"
-        for text in (*recording.format_detection_notes, *recording.notes)
-    ]
+    notes = [f"{name}: {text}" for text in (*recording.format_detection_notes, *recording.notes)]
     log = flight.log
     dropped_counts = dict(log.dropped)
     if recording.dropped_row_count and not clock_map:
-        dropped_counts[recording.name] = recording.dropped_row_count
+        dropped_counts[name] = recording.dropped_row_count
     return replace(
         flight,
         log=structs.replace(log, notes=(*log.notes, *notes), dropped=dropped_counts),
         positions=(track, *flight.positions),
-        inputs=(InputFile(recording.name, recording.sha256, recording.size_bytes, "position"),),
+        inputs=(InputFile(name, recording.sha256, recording.size_bytes, "position"),),
     )
 
 

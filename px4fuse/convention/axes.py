@@ -439,7 +439,7 @@ def _evaluate_hypothesis(
     independent_residual_count = (
         np.count_nonzero(is_used) * row_interval_s / SECOND_DIFFERENCE_WINDOW_S
     )
-    rejected_result = replace(hypothesis, score=-np.inf), np.zeros(len(PARAMETER_PRIOR_PRECISION))
+    rejected_result = replace(hypothesis, score=-np.inf), np.zeros_like(PARAMETER_PRIOR_PRECISION)
     if independent_residual_count * SECOND_DIFFERENCE_WINDOW_S < MIN_OVERLAP_S:
         return rejected_result
     grid_index, time_s = grid_index[is_used], time_s[is_used]
@@ -513,7 +513,7 @@ def _evaluate_hypothesis(
         weighted_design_columns @ residual.ravel()
         + (PARAMETER_PRIOR_PRECISION * hypothesis.parameters)[is_parameter_estimated]
     )
-    parameter_step = np.zeros(len(PARAMETER_PRIOR_PRECISION))
+    parameter_step = np.zeros_like(PARAMETER_PRIOR_PRECISION)
     parameter_step[is_parameter_estimated] = -np.linalg.solve(normal_matrix, gradient)
     parameter_step[DELAY] = np.clip(
         parameter_step[DELAY], -MAX_TIME_OFFSET_STEP_S, MAX_TIME_OFFSET_STEP_S

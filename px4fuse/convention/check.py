@@ -113,31 +113,30 @@ def check_convention(
     hypotheses = _rank_convention_hypotheses(positions, imu_motion_by_heading_source)
     if not hypotheses:
         return None
+    best_hypothesis, *other_hypotheses = hypotheses
     if clock_drift := _estimate_clock_drift(
-        positions, imu_motion_by_heading_source[hypotheses[0].heading_from], hypotheses[0]
+        positions, imu_motion_by_heading_source[best_hypothesis.heading_from], best_hypothesis
     ):
         positions_without_drift = positions.remove_clock_drift(clock_drift)
-        hypotheses_without_drift = _rank_convention_hypotheses(
+        hypotheses = _rank_convention_hypotheses(
             positions_without_drift, imu_motion_by_heading_source
         )
-        if (
-            hypotheses_without_drift
-            and hypotheses_without_drift[0].score
-            > hypotheses[0].score + MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT
-        ):
-            hypotheses, positions = hypotheses_without_drift, positions_without_drift
+        min_score = best_hypothesis.score + MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT
+        if hypotheses and hypotheses[0].score > min_score:
+            best_hypothesis, *other_hypotheses = hypotheses
+            positions = positions_without_drift
         else:
             clock_drift = 0.0
-    hypotheses[0] = _replace_delay_by_low_pass_filter(
-        hypotheses[0], positions, imu_motion_by_heading_source[hypotheses[0].heading_from]
+    best_hypothesis = _replace_delay_by_low_pass_filter(
+        best_hypothesis, positions, imu_motion_by_heading_source[best_hypothesis.heading_from]
     )
     if not is_source_fused(flight):
-        hypotheses[0] = _rotate_to_gnss(hypotheses[0], positions, flight, track)
-    convention = _choose_convention(hypotheses, positions, clock_drift)
+        best_hypothesis = _rotate_to_gnss(best_hypothesis, positions, flight, track)
+    convention = _choose_convention(best_hypothesis, other_hypotheses, positions, clock_drift)
     if track.orientation is None:
         return convention
     orientation = _check_orientation(
-        inertial_data, track, positions, hypotheses[0], convention.verdict
+        inertial_data, track, positions, best_hypothesis, convention.verdict
     )
     return structs.replace(convention, orientation=orientation)
 
@@ -241,15 +240,17 @@ def _rotate_to_gnss(
 
 
 def _choose_convention(
-    hypotheses: list[Hypothesis], positions: SentPositions, clock_drift: float
+    best_hypothesis: Hypothesis,
+    other_hypotheses: list[Hypothesis],
+    positions: SentPositions,
+    clock_drift: float,
 ) -> Convention:
-    """Return the best hypothesis, which is the first, with verdict and alternatives."""
-    best_hypothesis = hypotheses[0]
+    """Return the best hypothesis, with its verdict and the likely ones of the others."""
     # Without heights, z up and z down fit equally well
     has_heights = positions.position_m[:, 2].any()
     other_hypotheses = [
         hypothesis
-        for hypothesis in hypotheses
+        for hypothesis in other_hypotheses
         if not hypothesis.is_similar_to(best_hypothesis)
         and (has_heights or hypothesis.axes[:2] != best_hypothesis.axes[:2])
     ]

@@ -424,9 +424,12 @@ def _find_large_height_error_m(analysis: Analysis, span_s: Span) -> float | None
     if isinstance(errors, Unavailable):
         return None
     error_m = errors["error_m"].abs()
-    is_in_span = (error_m.index >= span_s[0]) & (error_m.index <= span_s[1])
-    largest_error_m = float(error_m[is_in_span].max())
-    is_large = largest_error_m > MIN_GAP_ERROR_TO_HEIGHT_RMSE_RATIO * rms(error_m[~is_in_span])
+    error_in_span_m = error_m.loc[slice(*span_s)]
+    largest_error_m, other_errors_m = (
+        float(error_in_span_m.max()),
+        error_m.drop(error_in_span_m.index),
+    )
+    is_large = largest_error_m > MIN_GAP_ERROR_TO_HEIGHT_RMSE_RATIO * rms(other_errors_m)
     return largest_error_m if is_large else None
 
 

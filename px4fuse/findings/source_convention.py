@@ -76,22 +76,25 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
     findings_of_unusable_positions = [
         item for item in findings if FINDING_CATALOGUE[item.id].report_class == "unusable"
     ]
+    effects = [
+        item
+        for item in findings
+        if FINDING_CATALOGUE[item.id].status_if_convention_wrong == "effect"
+    ]
     if findings_of_unusable_positions:
         # A convention found with unusable positions is not valid, nor are findings from positions.
-        # A lever arm does not change the heading of the orientation
-        has_only_lever_arm_finding = {item.id for item in findings_of_unusable_positions} == {
-            "source_lever_arm"
-        }
+        # But a lever arm does not change the heading of the orientation
+        if {item.id for item in findings_of_unusable_positions} != {"source_lever_arm"}:
+            cause_findings = []
         cause_findings = [
-            item
-            for item in cause_findings
-            if has_only_lever_arm_finding and item.id == "source_orientation_wrong"
-        ] + findings_of_unusable_positions
+            *(item for item in cause_findings if item.id == "source_orientation_wrong"),
+            *findings_of_unusable_positions,
+        ]
         findings = [
             item
             for item in findings
             if item in cause_findings
-            or _is_effect_of_wrong_convention(item)
+            or item in effects
             or (
                 FINDING_CATALOGUE[item.id].group in POSITION_INDEPENDENT_FINDING_GROUPS
                 and item.id != "accelerometer_bias"
@@ -117,30 +120,21 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
     ]
     # With unknown axes, findings that need the positions are not valid
     if faults.is_ambiguous and not findings_of_unusable_positions:
-        return [
-            *cause_findings,
-            *(
-                item
-                for item in other_findings
-                if _is_effect_of_wrong_convention(item) or item.severity == "note"
-            ),
+        return cause_findings + [
+            item for item in other_findings if item in effects or item.severity == "note"
         ]
-    # Effects of other causes than the convention are dropped, because their cause is not certain
-    findings_caused_by_convention = [
-        replace(item, message=f"{item.title}.", caused_by=cause_findings[0].id)
-        for item in other_findings
-        if _is_effect_of_wrong_convention(item) and item.caused_by is None
-    ]
+    first_cause, *other_causes = cause_findings
     return [
-        cause_findings[0],
-        *findings_caused_by_convention,
-        *cause_findings[1:],
-        *(item for item in other_findings if not _is_effect_of_wrong_convention(item)),
+        first_cause,
+        # Effects of other causes are dropped: without the wrong convention, they may be absent
+        *(
+            replace(item, message=f"{item.title}.", caused_by=first_cause.id)
+            for item in other_findings
+            if item in effects and item.caused_by is None
+        ),
+        *other_causes,
+        *(item for item in other_findings if item not in effects),
     ]
-
-
-def _is_effect_of_wrong_convention(item: Finding) -> bool:
-    return FINDING_CATALOGUE[item.id].status_if_convention_wrong == "effect"
 
 
 def _detect_position_faults(

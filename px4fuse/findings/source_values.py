@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 from scipy.interpolate import CubicHermiteSpline
 
 from px4fuse.analysis import Analysis
@@ -303,9 +304,8 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
         state.index, state[Columns.POSITION], state[Columns.VELOCITY]
     )
 
-    def compute_median_distance_m(delay_s: float, interval: int = 1) -> float:
-        """Return the median distance (m) of every ``interval``-th position from EKF2's position."""
-        positions = samples[::interval]
+    def compute_median_distance_m(positions: pd.DataFrame, delay_s: float) -> float:
+        """Return the median distance (m) of positions from EKF2's position before a delay."""
         time_s = positions.index.to_numpy() - delay_s
         is_moving = (
             np.linalg.norm(ekf2_position_spline(time_s, 1), axis=1)
@@ -318,12 +318,12 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
         return float(np.median(distance_m[is_inside]))
 
     # Some of the positions are sufficient to find the delay
-    interval = max(1, len(samples) // POSITION_COUNT_TO_FIND_DELAY_OF_COPY)
+    some_samples = samples[:: max(1, len(samples) // POSITION_COUNT_TO_FIND_DELAY_OF_COPY)]
     delay_s = min(
         TESTED_DELAYS_OF_COPIED_ESTIMATE_S.tolist(),
-        key=lambda delay_s: compute_median_distance_m(delay_s, interval),
+        key=lambda delay_s: compute_median_distance_m(some_samples, delay_s),
     )
-    distance_m = compute_median_distance_m(delay_s)
+    distance_m = compute_median_distance_m(samples, delay_s)
     fusion_flags = ekf2.fusion_flags
     is_fused = isinstance(fusion_flags, Unavailable) or bool(
         (fusion_flags["horizontal"][segment.start_s : segment.end_s] > 0.0).any()
