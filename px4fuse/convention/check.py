@@ -136,7 +136,7 @@ def check_convention(
     if track.orientation is None:
         return convention
     orientation = _check_orientation(
-        inertial_data, track, positions, best_hypothesis, convention.verdict
+        inertial_data, track.orientation, positions, best_hypothesis, convention.verdict
     )
     return structs.replace(convention, orientation=orientation)
 
@@ -375,26 +375,26 @@ def _estimate_clock_drift(
 
 def _check_orientation(
     inertial_data: InertialData,
-    track: PositionTrack,
+    sent_orientation: pd.DataFrame,
     positions: SentPositions,
     best_hypothesis: Hypothesis,
     verdict: ConventionVerdict,
 ) -> OrientationConvention | None:
     """Return the convention of the source's orientation, and the heading error if determinable."""
-    assert track.orientation is not None
     orientation_check_result = check_orientation(
         inertial_data,
-        track.orientation.index.to_numpy(),
-        track.orientation[Columns.QUATERNION].to_numpy(),
+        sent_orientation.index.to_numpy(),
+        sent_orientation[Columns.QUATERNION].to_numpy(),
     )
     if orientation_check_result is None:
         return None
     convention, time_s, attitude = orientation_check_result
+    axis_permutation = best_hypothesis.axis_permutation
     if (
         verdict != "determined"
         or convention.verdict not in ("determined", "ambiguous")
-        or best_hypothesis.axis_permutation.vertical_axis != 2
-        or best_hypothesis.axis_permutation.is_mirrored
+        or axis_permutation.vertical_axis != 2
+        or axis_permutation.is_mirrored
     ):
         return convention
     # Integrate the IMU with the heading of the source's orientation. The heading of the positions
@@ -408,17 +408,17 @@ def _check_orientation(
     )
     imu_motion = replace(imu_motion, is_valid=imu_motion.is_valid & is_covered)
     # Headings (°) of the x axis of the positions if the source's orientation has no heading error
-    if best_hypothesis.axis_permutation.vertical_sign > 0 or convention.frames == "FLU to NWU":
+    if axis_permutation.vertical_sign > 0 or convention.frames == "FLU to NWU":
         expected_x_axis_headings_deg = [0.0]
     elif convention.frames == "FLU to ENU":
         expected_x_axis_headings_deg = [90.0]
     else:  # z points up: NWU or ENU
         expected_x_axis_headings_deg = [0.0, 90.0]
-    axes_and_unit = best_hypothesis.axis_permutation, best_hypothesis.unit
     for hypothesis in search_hypotheses(positions, {"EKF2": imu_motion}):
-        if hypothesis.has_rotation and axes_and_unit == (
-            hypothesis.axis_permutation,
-            hypothesis.unit,
+        if (
+            hypothesis.has_rotation
+            and hypothesis.axis_permutation == axis_permutation
+            and hypothesis.unit == best_hypothesis.unit
         ):
             heading_errors_deg = (
                 math.remainder(np.degrees(hypothesis.parameters[HEADING]) - expected_deg, 360.0)

@@ -105,10 +105,7 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
             f"than {aid.noise} ({noise_setting_m:g} m)."
         )
         action += f" Or let the position source report a variance of {estimated_noise_m**2:.2g} m²."
-    if analysis.source.origin.is_gnss and math.isclose(
-        analysis.settings.sigma_z_m, used_noise_m, rel_tol=1e-2
-    ):
-        message += f" KF takes SIGMA_Z from {aid.noise}."
+
     yield finding(
         error_if(factor >= MIN_NOISE_FACTOR_FOR_ERROR),
         f"ekf2_noise_too_{size_word}",

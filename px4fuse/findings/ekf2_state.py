@@ -26,7 +26,7 @@ from px4fuse.findings.model import (
     make_warning,
     make_zero_length_spans,
 )
-from px4fuse.flight.ekf2_parameters import BAROMETER, MAG
+from px4fuse.flight.ekf2_parameters import MAG
 from px4fuse.flight.model import (
     BODY_AXES,
     Columns,
@@ -127,27 +127,19 @@ def _detect_bias_at_limit(
                     f"instead of {constants.g:.2f} (bias {constants.g - force_m_s2:+.2f} m/s² "
                     "down)."
                 )
+        if axis_index == 2 and (down_comparison := analysis.axes.get("down")) is not None:
+            truth = down_comparison.filters["ekf2"].truth
+            if isinstance(truth, ErrorsAgainstTruth):
+                message += (
+                    " EKF2's height RMSE against ground truth is "
+                    f"{format_metres(truth.position_rmse_m)} m."
+                )
         yield make_error(
             "ekf2_bias_at_limit",
-            message + (_describe_height_error(analysis, ekf2) if axis_index == 2 else ""),
+            message,
             f"Calibrate the {sensor}s at the temperature of the flight.",
             {"bias": median_bias, "limit": limit, "limited_fraction": time_at_limit_fraction},
         )
-
-
-def _describe_height_error(analysis: Analysis, ekf2: Ekf2) -> str:
-    error_text, down_comparison = "", analysis.axes.get("down")
-    truth = None if down_comparison is None else down_comparison.filters["ekf2"].truth
-    if isinstance(truth, ErrorsAgainstTruth):
-        error_text = (
-            f" EKF2's height RMSE against ground truth is {format_metres(truth.position_rmse_m)} m."
-        )
-    if (barometer_log := ekf2.aids.get(BAROMETER.name)) is not None:
-        innovations = cut_to_segment(barometer_log.samples, analysis.segment)[
-            f"innovation_{barometer_log.axes[0]}"
-        ]
-        error_text += f" Barometer innovations have a mean of {abs(innovations.mean()):.1f} m."
-    return error_text
 
 
 def _detect_gyro_bias(bias_states: pd.DataFrame, median_imu_at_rest: pd.Series | None) -> Findings:

@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.changes import MIN_RERUN_SIGMA_Z_M, SIGMA_A, SIGMA_Z, find_axis_tuning
+from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z, find_axis_tuning
 from px4fuse.comparison.estimates import find_first_available_tuning
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
@@ -160,15 +160,13 @@ def _make_setting_finding(
     else:
         effect, gain_size_word = "KF follows the positions slowly", "small"
     size_word = "small" if is_too_small else "large"
-    action, note = format_setting_action(analysis, name), ""
-    if name == SIGMA_Z and estimated_noise < MIN_RERUN_SIGMA_Z_M:
-        note = f" Re-runs use a SIGMA_Z of at least {MIN_RERUN_SIGMA_Z_M:g} m."
+    action = format_setting_action(analysis, name)
     return finding(
         "note" if action == NO_IMPROVEMENT_ACTION else severity,
         f"{label.lower()}_too_{size_word}",
         f"{label} is {'at least ' if noise.value is None else ''}{format_factor(factor)} "
         f"times too {size_word}: {effect}. {format_estimate(name, setting, noise)}. KF's gain is "
-        f"too {gain_size_word}.{note}",
+        f"too {gain_size_word}.",
         action,
         {
             "chosen": setting,

@@ -70,8 +70,8 @@ def detect_lost_data(flight: Flight) -> Findings:
         yield make_note(
             "samples_out_of_order",
             f"{log.dropped[topic]} samples of the topic {topic} have wrong timestamps: zero, or "
-            "earlier than the previous timestamp. Possible cause: a clock was set back, or messages "
-            "arrived in another order.",
+            "earlier than the previous timestamp. Possible cause: a clock was set back, or "
+            "messages arrived in another order.",
             "Synchronise the clock of the sending computer before take-off (TIMESYNC).",
             {"notes": len(log.dropped)},
         )

@@ -43,7 +43,6 @@ from px4fuse.findings.source_stamps import detect_arrival_timestamps
 from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import (
     Columns,
-    Ekf2,
     PositionTrack,
     Truth,
     Unavailable,
@@ -90,8 +89,6 @@ MAX_MEDIAN_SHIFT_DEVIATION_FRACTION = 0.5
 MAX_JUMP_TO_MEDIAN_INTERVAL_RATIO = 1.5
 # Positions alternate if at least this fraction of the jumps reverses the previous jump
 MIN_OPPOSITE_JUMP_FRACTION = 0.7
-# Maximum time (s) from a position jump to the reset of EKF2 that the jump causes
-MAX_JUMP_TO_RESET_TIME_S = 5.0
 MAX_LISTED_JUMPS = 8
 # Maximum rounding difference (s) between the timestamps of a position and of its reset_counter
 RESET_TIME_TOLERANCE_S = 1e-4
@@ -269,23 +266,10 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
 
 def detect_repeated_jumps(analysis: Analysis) -> Findings:
     """Detect repeated jumps: a source corrects its drift, or alternates between two positions."""
-    ekf2 = analysis.flight.ekf2
     times_s, jump_vectors_m, is_announced_by_source = _find_jumps(analysis)
     if len(times_s) < MIN_JUMPS_WITHOUT_RESET_COUNTER and not is_announced_by_source:
         return
     jump_sizes_m = np.linalg.norm(jump_vectors_m, axis=1)
-    ekf2_resets = ekf2.find_horizontal_resets() if isinstance(ekf2, Ekf2) else []
-    first_reset_delays_s = [
-        min((reset.time_s - at_s for reset in ekf2_resets if reset.time_s > at_s), default=np.inf)
-        for at_s in times_s
-    ]
-    reset_delays_s = [delay for delay in first_reset_delays_s if delay < MAX_JUMP_TO_RESET_TIME_S]
-    reset_sentence = ""
-    if reset_delays_s:
-        reset_sentence = (
-            " EKF2 rejects the positions after a jump and resets its position "
-            f"{np.median(reset_delays_s):.1f} s later."
-        )
     jump_times_text = ", ".join(f"{at_s:.1f}" for at_s in times_s[:MAX_LISTED_JUMPS])
     is_reversal = np.sum(jump_vectors_m[1:] * jump_vectors_m[:-1], axis=1) < 0.0
     if is_announced_by_source:
@@ -306,7 +290,7 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
         "source_relocalises",
         f"The source jumps {len(times_s)} times, by up to {jump_sizes_m.max():.2f} m. Times: "
         f"{jump_times_text} s, about every {np.median(np.diff(times_s)):.0f} s. "
-        f"{counter_sentence} {cause_sentence}{reset_sentence}",
+        f"{counter_sentence} {cause_sentence}",
         f"{action} Analyse the time between two jumps (--start, --end).",
         {
             "count": len(times_s),
