@@ -171,7 +171,10 @@ def align_position_file(
     if frame:
         frame_reason = "the frame was given with --position-frame"
     elif match and len(problem.frames) != 1:
-        frame_reason = _explain_best_frame(match, problem)
+        frame_reason = (
+            f"{match.frame} is the tested frame with the smallest residual against the "
+            f"{match.reference.name} ({match.residuals_text})"
+        )
     elif recording.format:
         frame_reason = f"the format {recording.format} defines the frame"
     else:
@@ -238,16 +241,6 @@ def _check_options(
             raise SettingsError(f"`{name}` {value:g} is not a finite number.")
 
 
-def _explain_best_frame(match: Match, problem: AlignmentProblem) -> str:
-    reason = (
-        f"{match.frame} is the tested frame with the smallest residual against the "
-        f"{match.reference.name} ({match.residuals_text})"
-    )
-    if problem.yaw_rad is None and match.frame == "enu":
-        reason += "; nwu was not tested, because it is enu with another yaw"
-    return reason
-
-
 def _apply_alignment(
     flight: Flight,
     recording: PositionRecording,
@@ -262,12 +255,12 @@ def _apply_alignment(
     Yaw and time offset are those of the user or, if the user gave none, those of the match. Without
     a match, the user gave all parameters.
     """
-    boot_time_s, file_start_s = flight.log.boot_time_s, problem.samples.index[0]
+    boot_time_s, is_yaw_estimated = flight.log.boot_time_s, problem.yaw_rad is None
     frame = match.frame if match else problem.frames[0]
     reference_name = match.reference.name if match else ""
     yaw_rad, lag_s, origin_m = problem.yaw_rad or 0.0, problem.lag_s or 0.0, np.zeros(3)
     yaw_sigma_deg = time_offset_sigma_s = reference_correlation = residual_rms_m = None
-    if match and problem.yaw_rad is None:
+    if match and is_yaw_estimated:
         yaw_rad = match.fit.yaw_rad
         yaw_sigma_deg = float(np.degrees(match.fit.yaw_sigma_rad or 0.0))
         if reference_name == EKF2_REFERENCE:  # the IMU does not determine the origin
@@ -276,7 +269,7 @@ def _apply_alignment(
     if match and clock_offset_s is None:
         lag_s = match.time_offset_fit.lag_s
         time_offset_sigma_s = match.time_offset_fit.lag_sigma_s
-        clock_offset_s = lag_s + (boot_time_s - file_start_s)
+        clock_offset_s = lag_s + (boot_time_s - problem.samples.index[0])
         time_offset_reason = (
             f"the position file was matched in time with the {reference_name}; the time offset "
             f"includes any delay of the {reference_name}"
@@ -296,12 +289,12 @@ def _apply_alignment(
         residual_rms_m = float(np.sqrt(np.mean(distance_to_ekf2_m**2) / 2.0))
     frame_conflict, warnings = "", list[str]()
     if match:
-        warnings += _find_warnings(match, problem.yaw_rad is None)
-        if problem.yaw_rad is not None:
+        warnings += _find_warnings(match, is_yaw_estimated)
+        if not is_yaw_estimated:
             frame_conflict = _describe_frame_conflict(match, distance_to_ekf2_m, yaw_rad)
     if (
         distance_to_ekf2_m is not None
-        and not (problem.yaw_rad is None or frame_conflict)
+        and not (is_yaw_estimated or frame_conflict)
         and reference_correlation is not None
         and reference_correlation < MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[EKF2_REFERENCE]
     ):

@@ -281,7 +281,7 @@ def _assess_span(
     innovations = analysis.main.ekf2_tracks.innovations
     if isinstance(innovations, Unavailable):
         return innovations, rmse_m
-    samples = innovations[(innovations.index >= start_s) & (innovations.index < end_s)]
+    samples = innovations.loc[start_s:end_s]
     consistency = Consistency.from_innovations(
         samples["innovation_m"].to_numpy(), samples["innovation_variance_m2"].to_numpy(), math.inf
     )

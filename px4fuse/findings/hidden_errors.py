@@ -12,7 +12,6 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compute_position_errors
 from px4fuse.comparison.model import (
     FILTER_NAMES,
-    AxisComparison,
     Comparison,
     ErrorsAgainstTruth,
     FilterName,
@@ -138,6 +137,7 @@ def make_hidden_error_finding(
             "position_rmse_aligned_m": after_m,
         }
         is_misaligned = after_m < MAX_ALIGNED_RMSE_RATIO * before_m
+    kf_errors = analysis.axes[worst_axis].filters["kf"].truth
     if cause is not None:
         remedy = format_action(analysis, cause.change)
     elif is_misaligned:
@@ -145,8 +145,10 @@ def make_hidden_error_finding(
         remedy = FRAME_REMEDY
     elif analysis.source.origin.may_drift:
         return _make_drift_finding(analysis, rmse_text, evidence, tuple(ratio_texts))
-    elif error_by_filter.keys() == {"ekf2"} and _has_smaller_kf_error(
-        analysis.axes[worst_axis], worst_error.rmse_m
+    elif (
+        error_by_filter.keys() == {"ekf2"}
+        and isinstance(kf_errors, ErrorsAgainstTruth)
+        and kf_errors.position_rmse_m < MAX_KF_TO_EKF2_RMSE_RATIO * worst_error.rmse_m
     ):
         remedy = EKF2_HEIGHT_REMEDY if worst_axis == "down" else EKF2_REMEDY
     else:
@@ -164,14 +166,6 @@ def make_hidden_error_finding(
         f"{' '.join(sentences)}",
         remedy,
         evidence,
-    )
-
-
-def _has_smaller_kf_error(result: AxisComparison, ekf2_rmse_m: float) -> bool:
-    kf_errors = result.filters["kf"].truth
-    return (
-        isinstance(kf_errors, ErrorsAgainstTruth)
-        and kf_errors.position_rmse_m < MAX_KF_TO_EKF2_RMSE_RATIO * ekf2_rmse_m
     )
 
 

@@ -294,13 +294,11 @@ def _make_wrong_sigma_finding(
         severity = lower_severity(severity)
     cause, remedy_text, is_note = _explain_wrong_sigma(analysis, filter_name, worst_axis, summary)
     low, high = summary.nis_band
-    verdict, size_word = (
-        ("underconfident", "large") if summary.sigma_ratio < 1.0 else ("overconfident", "small")
-    )
+    size_word = "large" if summary.sigma_ratio < 1.0 else "small"
     return finding(
         "note" if is_note else severity,
-        f"{filter_name}_{verdict}",
-        f"{FILTER_NAMES[filter_name]} is {verdict} along {worst_axis.axis.label}: σ is "
+        f"{filter_name}_{summary.verdict}",
+        f"{FILTER_NAMES[filter_name]} is {summary.verdict} along {worst_axis.axis.label}: σ is "
         f"{format_ratio(summary.sigma_error_factor)} times too {size_word}. The mean NIS is "
         f"{format_number(summary.nis_mean)}, expected {low:.2f} to {high:.2f}.",
         remedy_text,

@@ -157,13 +157,15 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     lever_arm = estimate_lever_arm(analysis.flight, source)
     if lever_arm is None:
         return
-    sigma_m, imu_position_m = lever_arm.sigma_m, find_imu_position_m(analysis.flight)
-    # + 0.0 replaces -0.0 by 0.0
-    forward_m, right_m = (np.round(lever_arm[:2], 2) + 0.0).tolist()
-    lever_arm_m = np.add(source.lever_arm_m[:2], lever_arm[:2]).round(2) + 0.0
-    change = dict(zip(find_aid(analysis).lever_arm, lever_arm_m.tolist(), strict=False))
-    imu_arm_m = np.subtract(imu_position_m[:2], lever_arm[:2]).round(2) + 0.0
-    imu_position_change = dict(zip(IMU_POSITION_PARAMETERS, imu_arm_m.tolist(), strict=False))
+    imu_position_m, arm_m = find_imu_position_m(analysis.flight), np.array(lever_arm[:2])
+    # Forward and right: error of the lever arm, correct position of the sensor, and correct
+    # position of the IMU if the sensor's is right. + 0.0 replaces -0.0 by 0.0
+    (forward_m, right_m), sensor_arm_m, imu_arm_m = (
+        (position_m.round(2) + 0.0).tolist()
+        for position_m in (arm_m, source.lever_arm_m[:2] + arm_m, imu_position_m[:2] - arm_m)
+    )
+    change = dict(zip(find_aid(analysis).lever_arm, sensor_arm_m, strict=False))
+    imu_position_change = dict(zip(IMU_POSITION_PARAMETERS, imu_arm_m, strict=False))
     rotation_deg = (
         lever_arm.rotation_deg
         + find_convention_faults(convention, analysis.flight, source.frame).rotation_deg
@@ -203,10 +205,10 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
         "source_lever_arm",
         f"{subject} mounted {np.hypot(forward_m, right_m):.2f} m from the mounting "
         f"point that EKF2 assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m right (± "
-        f"{1.96 * sigma_m:.2f} m, 95 %). When the vehicle turns, {error_text} changes by up to "
-        f"twice this distance. {effect_sentence}{NO_ESTIMATES_SENTENCE}",
+        f"{1.96 * lever_arm.sigma_m:.2f} m, 95 %). When the vehicle turns, {error_text} changes by "
+        f"up to twice this distance. {effect_sentence}{NO_ESTIMATES_SENTENCE}",
         f"{action} Measure the position of the sensor relative to the IMU.",
-        {"forward_m": forward_m, "right_m": right_m, "sigma_m": sigma_m},
+        {"forward_m": forward_m, "right_m": right_m, "sigma_m": lever_arm.sigma_m},
     )
 
 
