@@ -196,9 +196,8 @@ def _match_with_reference(
     fit_with_estimated_yaw = fit
     if yaw_rad is not None:
         fit_with_estimated_yaw = _fit_file_in_frame(problem, reference, best_frame, None)
-    min_concordance = MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference.name]
     is_given_yaw_wrong = is_reliable_fit(fit_with_estimated_yaw, reference.name) and (
-        fit.concordance_correlation < min_concordance
+        fit.concordance_correlation < MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference.name]
         or needs_rotation(fit.horizontal_rms_m, fit_with_estimated_yaw, reference.name)
     )
     return Match(

@@ -37,8 +37,7 @@ STUDENT_DEGREES_OF_FREEDOM = 4.0
 METRES_PER_UNIT: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
 # A frame that is rotated from NED by at most this angle (rad) is a misaligned NED frame
 SMALL_ROTATION_RAD = np.radians(8.0)
-# A frame without rotation is tested too, if the first estimate of the rotation (rad) is smaller
-MAX_ROTATION_TO_TEST_NONE_RAD = 3.0 * SMALL_ROTATION_RAD
+
 # Time offsets up to this value (s) are equally probable a priori
 SMALL_TIME_OFFSET_S = 0.3
 # Log prior odds of a frame that is rotated by more than SMALL_ROTATION_RAD
@@ -239,9 +238,10 @@ def search_hypotheses(
         source_motion = positions.compute_second_differences(imu_motion)
         for candidate in find_convention_candidates(source_motion, imu_motion):
             start_hypotheses = [replace(candidate, heading_from=heading_from)]
-            # Also test a heading fixed to a multiple of 90°: it has one parameter less
+            # If the first estimate of the rotation is small, also test a heading that is fixed to a
+            # multiple of 90°: this hypothesis has one parameter less
             rotation_rad = candidate.heading_minus_quarter_turns_rad
-            if abs(rotation_rad) < MAX_ROTATION_TO_TEST_NONE_RAD:
+            if abs(rotation_rad) < 3.0 * SMALL_ROTATION_RAD:
                 parameters = candidate.parameters.copy()
                 parameters[HEADING] -= rotation_rad
                 start_hypotheses.append(

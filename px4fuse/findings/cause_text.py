@@ -105,7 +105,7 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
 
 def _list_actions(analysis: Analysis, change: Mapping[str, float]) -> Iterator[str]:
     if change.get(rerun_effects.OUTLIERS_KEY):
-        yield find_source_texts(analysis.source).outlier_action
+        yield find_source_texts(analysis).outlier_action
     if rerun_effects.FORWARD_BIAS_KEY in change:
         yield "Calibrate the accelerometer and the level horizon."
     if rotation_deg := change.get(rerun_effects.ROTATION_KEY):

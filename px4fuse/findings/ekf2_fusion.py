@@ -442,8 +442,6 @@ def _find_shared_sensor_cause(fusion_parameter: str, kf_position_aid: str) -> st
 
     Both are from one sensor if the same EKF2 parameter enables their fusion. Otherwise, return "".
     """
-    return (
-        SOURCE_SENSOR_CAUSE
-        if kf_position_aid and AIDS[kf_position_aid].switch == fusion_parameter
-        else ""
-    )
+    if kf_position_aid and AIDS[kf_position_aid].switch == fusion_parameter:
+        return SOURCE_SENSOR_CAUSE
+    return ""

@@ -67,18 +67,18 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
     if rerun is None:
         return
     assert not isinstance(analysis.ekf2_model, Unavailable)
-    inputs = analysis.ekf2_model.inputs
-    used_noise_m, estimated_noise_m = find_used_noise_m(inputs), rerun.change[aid.noise]
+    inputs, parameter = analysis.ekf2_model.inputs, aid.noise
+    used_noise_m, estimated_noise_m = find_used_noise_m(inputs), rerun.change[parameter]
     # EKF2 uses the larger of reported σ and noise parameter
-    noise_setting_m = inputs.settings[aid.noise]
+    noise_setting_m = inputs.settings[parameter]
     uses_reported_sigma = used_noise_m > noise_setting_m
     ratio = estimated_noise_m / used_noise_m
     is_too_small = ratio >= 1.0
     factor, size_word = (ratio, "small") if is_too_small else (1.0 / ratio, "large")
     sensor_name = analysis.source.kind_name
-    name = "EKF2's assumed measurement noise" if uses_reported_sigma else aid.noise
+    name = "EKF2's assumed measurement noise" if uses_reported_sigma else parameter
     # PX4's default suits usual sensors: if it is too small, this sensor is noisier
-    is_default_noise = used_noise_m == analysis.flight.log.find_default_value(aid.noise)
+    is_default_noise = used_noise_m == analysis.flight.log.find_default_value(parameter)
     if is_too_small and is_default_noise:
         title = f"{sensor_name} noise is {format_factor(factor)} times the noise setting of EKF2"
     else:
@@ -102,10 +102,9 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
         mode_text = f" ({aid.noise_mode_parameter} 0)" if aid.noise_mode_parameter else ""
         message += (
             f" EKF2 uses the σ that {sensor_name} reports{mode_text}, because this σ is larger "
-            f"than {aid.noise} ({noise_setting_m:g} m)."
+            f"than {parameter} ({noise_setting_m:g} m)."
         )
         action += f" Or let the position source report a variance of {estimated_noise_m**2:.2g} m²."
-
     yield finding(
         error_if(factor >= MIN_NOISE_FACTOR_FOR_ERROR),
         f"ekf2_noise_too_{size_word}",
@@ -187,7 +186,7 @@ def _find_rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
     if helpful_reruns and result is analysis.main:
         return format_action(analysis, min(helpful_reruns, key=compute_preference_key).change)
     return (
-        f"{find_source_texts(analysis.source).data_link_check}. Then check {aid.delay} and "
+        f"{find_source_texts(analysis).data_link_check}. Then check {aid.delay} and "
         f"{aid.noise}. Increase {aid.gate} only if no fault is found."
     )
 

@@ -158,7 +158,7 @@ def make_hidden_error_finding(
                 "A time offset of the positions is possible, but this log cannot show it: "
                 f"{analysis.time_offset.reason}. {analysis.time_offset.remedy}"
             )
-        remedy += f" {find_source_texts(analysis.source).slow_error_check}."
+        remedy += f" {find_source_texts(analysis).slow_error_check}."
     return finding(
         error_if(worst_error.nees >= MIN_NEES_FOR_ERROR),
         "error_exceeds_reported_sigma",

@@ -10,12 +10,13 @@ import numpy as np
 import pandas as pd
 from msgspec.structs import replace
 
+from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.record import Record, Span, read_toml
 from px4fuse.core.text import capitalise_first
 from px4fuse.filter.signals import Segment
 from px4fuse.finding import SEVERITIES, Finding, Severity
 from px4fuse.flight.ekf2_parameters import MAG, MAG_TYPE_NONE
-from px4fuse.flight.model import Flight, PositionKind, PositionTrack
+from px4fuse.flight.model import Flight, PositionKind
 
 
 class CatalogueEntry(Record):
@@ -145,9 +146,9 @@ class SourceTexts(Record):
 SOURCE_TEXTS = read_toml(__file__, dict[PositionKind, SourceTexts], "source_words.toml")
 
 
-def find_source_texts(source: PositionTrack) -> SourceTexts:
-    """Return the texts about causes and actions for a position source, such as UWB."""
-    return SOURCE_TEXTS[source.origin.kind]
+def find_source_texts(comparison: PreparedComparison) -> SourceTexts:
+    """Return the texts about causes and actions for the kind of position source, such as UWB."""
+    return SOURCE_TEXTS[comparison.source.origin.kind]
 
 
 def magnetometer_advice(flight: Flight) -> str:

@@ -139,7 +139,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         f"correlation time {time_text}. The remaining error is white noise of "
         f"{noise.white_m:.2g} m (1 σ). KF and EKF2 assume independent errors: both follow the "
         "correlated error, and their σ is too small.",
-        f"{find_source_texts(analysis.source).slow_error_check}.",
+        f"{find_source_texts(analysis).slow_error_check}.",
         evidence,
     )
 
@@ -192,7 +192,7 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
         or noisy_sigma_low_m <= quiet_sigma_high_m
     ):
         return
-    action = f"{find_source_texts(analysis.source).slow_error_check}."
+    action = f"{find_source_texts(analysis).slow_error_check}."
     evidence = {"smaller_noise_sigma_z_m": quiet_sigma_m, "larger_noise_sigma_z_m": noisy_sigma_m}
     if noisy_axis in analysis.axes:
         action += (
@@ -229,7 +229,7 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
         "source_noise_varies",
         f"{analysis.source.kind_name} noise is {noisy_flight_part.sigma_ratio:.1f} times larger "
         f"from {start_s:.0f} to {end_s:.0f} s. Single outliers are not the cause.",
-        f"{find_source_texts(analysis.source).data_link_check} for the time from {start_s:.0f} to "
+        f"{find_source_texts(analysis).data_link_check} for the time from {start_s:.0f} to "
         f"{end_s:.0f} s. Send a variance with each position, or analyse the noisy part separately "
         "(--start, --end).",
         {"ratio": noisy_flight_part.sigma_ratio, "first_s": start_s, "until_s": end_s},
@@ -276,7 +276,7 @@ def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: Err
             f"{format_metres(periodic_error.amplitude_m)} m, period {periodic_error.period_s:.1f} "
             f"s. This sinusoid explains {format_percent(min(periodic_error.fraction, 1.0))} of the "
             "slow errors against ground truth. Innovations hardly show this error.",
-            f"{find_source_texts(analysis.source).slow_error_check}. Look for a process with this "
+            f"{find_source_texts(analysis).slow_error_check}. Look for a process with this "
             "period, such as a control loop.",
             periodic_error._asdict(),
         )
@@ -307,7 +307,7 @@ def detect_scale_error(analysis: Analysis, error_fit: ErrorFit) -> Findings:
             error_fit.scale,
             error_fit.scale_error_sigma,
             f"ground truth (± {format_percent(1.96 * error_fit.scale_error_sigma, 1)}, 95 %)",
-            f"{find_source_texts(analysis.source).scale_check}.",
+            f"{find_source_texts(analysis).scale_check}.",
         )
 
 

@@ -85,7 +85,7 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
         if finding_id == "source_gap":
             errors_text = describe_errors_after_gap(analysis, (start_s, end_s))
             message = f"No position for {duration_text}. {errors_text}"
-            action = f"{find_source_texts(source).data_link_check} at {start_s:.1f} s."
+            action = f"{find_source_texts(analysis).data_link_check} at {start_s:.1f} s."
         else:
             message = (
                 f"{source.positions_text} are missing in the log for {duration_text}, but EKF2 "
@@ -123,10 +123,10 @@ def _make_source_stops_or_begins_finding(
         before_or_after, start_or_end_text = "before", "after the start"
         action = "" if source.alignment else " Take off only when positions arrive."
     ekf2_errors_at_end = _find_ekf2_errors_at_end(analysis, span_s)
+    # The error, if known, or else the reported σ
     for name, quantity in (("sigma_m", "reported σ"), ("error_m", "position error")):
-        if name in ekf2_errors_at_end:
-            error_text = f"{format_metres(ekf2_errors_at_end[name])} m"
-            effect_sentence = f" EKF2's {quantity} at {end_s:.1f} s is {error_text}."
+        if (value_m := ekf2_errors_at_end.get(name)) is not None:
+            effect_sentence = f" EKF2's {quantity} at {end_s:.1f} s is {format_metres(value_m)} m."
     ekf2 = analysis.flight.ekf2
     has_aids = isinstance(ekf2, Ekf2) and bool(ekf2.aids)
     aiding_sentence = ""
@@ -139,7 +139,7 @@ def _make_source_stops_or_begins_finding(
         finding_id,
         f"{source.positions_text} {event} in flight at {event_s:.1f} s, {duration_s:.1f} s "
         f"{start_or_end_text} of the flight.{aiding_sentence}{effect_sentence}",
-        f"{find_source_texts(source).data_link_check} for the time {before_or_after} "
+        f"{find_source_texts(analysis).data_link_check} for the time {before_or_after} "
         f"{event_s:.1f} s.{action}",
         {"at_s": event_s, "duration_s": duration_s, **ekf2_errors_at_end},
         (span_s,),

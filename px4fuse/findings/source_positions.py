@@ -174,7 +174,7 @@ def detect_low_pass(analysis: Analysis) -> Findings:
             f"{low_pass.lag_s:.2f} s. The correlation of successive errors is "
             f"{low_pass.correlation:.1f}; the noise before filtering is {low_pass.sigma_z_m:.2g} "
             "m. KF and EKF2 lag, and their σ is too small.",
-            f"{find_source_texts(analysis.source).low_pass_action} Do not change the timestamps: "
+            f"{find_source_texts(analysis).low_pass_action} Do not change the timestamps: "
             "they are correct.",
             asdict(low_pass),
         )
@@ -196,7 +196,7 @@ def detect_jumps(analysis: Analysis) -> Findings:
     largest_jump = max(jumps, key=lambda jump: jump.size_m)
     size_m, time_s = largest_jump.size_m, largest_jump.time_s
     sigma_m = max(step.sigma for step in largest_jump.step_m)
-    source_texts = find_source_texts(analysis.source)
+    source_texts = find_source_texts(analysis)
     cause = source_texts.jump_causes
     evidence = {"count": len(jumps), "size_m": size_m, "at_s": time_s, "sigma_m": sigma_m}
     nearest_reset_counter_time_s = min(
@@ -277,7 +277,7 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
         cause_sentence = "The source (VIO or SLAM) drifts, and each jump corrects its drift."
     else:
         counter_sentence = "The source does not change reset_counter at the jumps."
-        cause_sentence = find_source_texts(analysis.source).jump_causes
+        cause_sentence = find_source_texts(analysis).jump_causes
     action = "Improve the tracking of the source, or let it correct its drift in smaller steps."
     # Most jumps go back: the source alternates between two positions
     if is_reversal.mean() >= MIN_OPPOSITE_JUMP_FRACTION:
@@ -376,7 +376,7 @@ def detect_scale_error(analysis: Analysis) -> Findings:
             sigma,
             f"the IMU (± {format_percent(1.96 * sigma)}, 95 %)",
             "Measure a known distance with the source. "
-            f"{find_source_texts(analysis.source).scale_check}. If the distance is right, "
+            f"{find_source_texts(analysis).scale_check}. If the distance is right, "
             "calibrate the accelerometers.",
         )
 
@@ -416,7 +416,7 @@ def detect_outliers(analysis: Analysis) -> Findings:
     outlier_fraction = outlier_count / axis_tuning.count
     if outlier_fraction < MIN_OUTLIER_FRACTION or outlier_count < MIN_OUTLIERS:
         return
-    source_texts = find_source_texts(analysis.source)
+    source_texts = find_source_texts(analysis)
     outlier_sizes_m, reference = compute_outlier_sizes_m(analysis, outlier_time_s)
     yield finding(
         error_if(outlier_fraction >= MIN_OUTLIER_FRACTION_FOR_ERROR),

@@ -117,7 +117,7 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
             name,
             f"{len(time_s)} {source.positions_text} {fault}. Times: {format_spans(spans)} "
             f"({total_s:.1f} s in total). KF does not use these positions.{error_text}",
-            action or f"{find_source_texts(source).data_link_check} at {start_s:.1f} s.",
+            action or f"{find_source_texts(analysis).data_link_check} at {start_s:.1f} s.",
             {
                 "count": len(time_s),
                 "longest_s": end_s - start_s,
