@@ -267,7 +267,7 @@ def find_convention_candidates(
     source_motion: SourceSecondDifferences, imu_motion: ImuSecondDifferences
 ) -> list[Hypothesis]:
     """Return the likely combinations of axes, unit and time offset, most likely first."""
-    # Second differences are 0 where they are invalid
+    # Invalid second differences are 0
     source, imu_m = source_motion.second_differences, imu_motion.table[..., 0].copy()
     source_is_valid, imu_is_valid = (
         motion.is_valid[:, None].astype(float) for motion in (source_motion, imu_motion)
