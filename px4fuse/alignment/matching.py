@@ -268,7 +268,7 @@ def _require_unique_match(match: Match) -> None:
 def _refit_without_origin_resets(flight: Flight, match: Match, problem: AlignmentProblem) -> Match:
     """Fit again to EKF2's position without resets that only moved the origin of its frame.
 
-    The first match shows the position of the file at each reset, which is needed to find such resets.
+    The first match gives the position of the file at each reset, which is needed to find these.
     """
     ekf2, fit = flight.ekf2, match.time_offset_fit
     if match.reference.name == IMU_REFERENCE or isinstance(ekf2, Unavailable) or not ekf2.resets:
