@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -20,7 +20,7 @@ from px4fuse.flight.model import Flight, PositionKind
 
 
 class CatalogueEntry(Record):
-    """Title, meaning (``catalogue.toml``) and classes (``classes.toml``) of a finding."""
+    """Title and meaning of a finding, and its relation to other findings (``catalogue.toml``)."""
 
     title: str
     meaning: str
@@ -31,21 +31,9 @@ class CatalogueEntry(Record):
     status_if_convention_wrong: Literal["", "effect", "withdrawn"] = ""
 
 
-# By field of CatalogueEntry and its value: ids of the findings, one per line
-_FINDINGS_BY_CLASS = read_toml(__file__, dict[str, dict[str, str]], "classes.toml")
 # All findings by id. The report lists findings of equal severity in this order
-FINDING_CATALOGUE = msgspec.convert(
-    {
-        name: entry
-        | {
-            field: value
-            for field, findings_by_value in _FINDINGS_BY_CLASS.items()
-            for value, findings in findings_by_value.items()
-            if name in findings.splitlines()
-        }
-        for name, entry in read_toml(__file__, dict[str, dict[str, Any]], "catalogue.toml").items()
-    },
-    dict[str, CatalogueEntry],
+FINDING_CATALOGUE: Mapping[str, CatalogueEntry] = read_toml(
+    __file__, dict[str, CatalogueEntry], "catalogue.toml"
 )
 # Key in Finding.evidence: cause of the finding, one of the following values
 CAUSE_KEY = "cause"
@@ -88,7 +76,7 @@ EFFECTS_BY_CAUSE: Mapping[str, str] = read_toml(__file__, dict[str, str], "conse
 NO_ESTIMATES_SENTENCE = (
     "px4fuse does not estimate noise, time offset or frame from these positions."
 )
-FINDING_GROUPS = ("position source", *_FINDINGS_BY_CLASS["group"])
+FINDING_GROUPS = ("position source", "time", "IMU", "tuning", "EKF2", "loops", "logging")
 FINDING_TITLES: Mapping[str, str] = {name: entry.title for name, entry in FINDING_CATALOGUE.items()}
 
 
