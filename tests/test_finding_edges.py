@@ -80,6 +80,7 @@ from px4fuse.flight.model import (
     Columns,
     Dropout,
     Reset,
+    Truth,
     Unavailable,
 )
 
@@ -942,15 +943,16 @@ def test_scale_and_variance_findings_state_sign_of_error() -> None:
 @pytest.mark.parametrize(("error_m", "expected"), [(1.41, "error"), (1.42, None)])
 def test_position_variance_that_covers_true_error_is_accepted(error_m, expected):
     time = np.arange(0.0, 120.0)
-    still = pd.DataFrame({"position_m": 0.0 * time}, index=time)
-    axes = tuple(axis(name, truth=still) for name in ("north", "east"))
-    for each in axes:
+    axes = tuple(axis(name) for name in ("north", "east"))
+    for each, direction in zip(axes, np.eye(3), strict=False):
         each.axis.measurement_time_s, each.axis.measurement_m = time, error_m * (-1.0) ** time
-    assert (
-        severity(source_positions.detect_wrong_variance, stating(2.0, 1.0, axes=axes)) == expected
-    )
+        each.axis.direction = direction
+    flight = {"truth": Truth("still", positions(time))}
+    subject = stating(2.0, 1.0, axes=axes, flight=flight)
+    assert severity(source_positions.detect_wrong_variance, subject) == expected
     # a variance that is too small is reported in both cases
-    assert severity(source_positions.detect_wrong_variance, stating(0.5, 1.0, axes=axes)) == "error"
+    subject = stating(0.5, 1.0, axes=axes, flight=flight)
+    assert severity(source_positions.detect_wrong_variance, subject) == "error"
 
 
 @pytest.mark.parametrize(

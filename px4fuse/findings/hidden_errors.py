@@ -28,6 +28,7 @@ from px4fuse.findings.loops import find_usable_loop
 from px4fuse.findings.model import (
     CAUSE_KEY,
     Findings,
+    error_if,
     find_source_texts,
     finding,
     format_percent,
@@ -89,12 +90,14 @@ def detect(analysis: Analysis) -> Findings:
 def make_hidden_error_finding(
     analysis: Analysis, errors_not_in_innovations: list[tuple[FilterName, str, ErrorAboveSigma]]
 ) -> Finding:
+    # The main axis first; then the first, largest error of each filter counts
     errors_not_in_innovations = sorted(
         errors_not_in_innovations, key=lambda entry: entry[1] != analysis.main.axis.name
     )
     worst_filter, worst_axis, worst_error = errors_not_in_innovations[0]
-    # Keep the first error of each filter
-    error_by_filter = {entry[0]: entry[1:] for entry in reversed(errors_not_in_innovations)}
+    error_by_filter = dict[FilterName, tuple[str, ErrorAboveSigma]]()
+    for filter_name, axis, error in errors_not_in_innovations:
+        error_by_filter.setdefault(filter_name, (axis, error))
     evidence: dict[str, float | str] = {"axis": worst_axis, "filter": worst_filter}
     ratio_texts, sentences = dict[str, str](), list[str]()
     rerun_by_filter = dict[FilterName, Rerun]()
@@ -118,12 +121,12 @@ def make_hidden_error_finding(
             f"{analysis.axes[axis].axis.label}, reported σ "
             f"{format_metres(error.reported_sigma_m)} m."
         )
+    # The cause of the worst error or, without it, that of the other filter's error
     cause = rerun_by_filter.get(worst_filter) or next(iter(rerun_by_filter.values()), None)
     evidence[CAUSE_KEY] = classify_cause(analysis, cause)
-    alignment_rmse = None if rerun_by_filter else _compute_alignment_rmse(analysis, worst_filter)
-    rmse_text = f"position RMSE {format_metres(worst_error.rmse_m)} m against ground truth"
     is_misaligned = False
-    if alignment_rmse is not None:
+    rmse_text = f"position RMSE {format_metres(worst_error.rmse_m)} m against ground truth"
+    if cause is None and (alignment_rmse := _compute_alignment_rmse(analysis, worst_filter)):
         before_m, after_m = alignment_rmse
         rmse_text = (
             f"horizontal position RMSE {format_metres(before_m)} m before and "
@@ -134,15 +137,14 @@ def make_hidden_error_finding(
             "position_rmse_aligned_m": after_m,
         }
         is_misaligned = after_m < MAX_ALIGNED_RMSE_RATIO * before_m
-        if is_misaligned:
-            sentences.append(f"The position frame is misaligned: {rmse_text}.")
-    if analysis.source.origin.may_drift and not rerun_by_filter and not is_misaligned:
-        return _make_drift_finding(analysis, rmse_text, evidence, tuple(ratio_texts))
     kf_errors = analysis.axes[worst_axis].filters["kf"].truth
     if cause is not None:
         remedy = format_action(analysis, cause.change)
     elif is_misaligned:
+        sentences.append(f"The position frame is misaligned: {rmse_text}.")
         remedy = FRAME_REMEDY
+    elif analysis.source.origin.may_drift:
+        return _make_drift_finding(analysis, rmse_text, evidence, tuple(ratio_texts))
     elif (
         error_by_filter.keys() == {"ekf2"}
         and isinstance(kf_errors, ErrorsAgainstTruth)
@@ -156,9 +158,9 @@ def make_hidden_error_finding(
                 "A time offset of the positions is possible, but this log cannot show it: "
                 f"{analysis.time_offset.reason}. {analysis.time_offset.remedy}"
             )
-        remedy += f" {find_source_texts(analysis.source).slow_error_check}."
+        remedy += f" {find_source_texts(analysis).slow_error_check}."
     return finding(
-        "error" if worst_error.nees >= MIN_NEES_FOR_ERROR else "warning",
+        error_if(worst_error.nees >= MIN_NEES_FOR_ERROR),
         "error_exceeds_reported_sigma",
         f"Position errors that innovations do not show: {', '.join(ratio_texts.values())}. "
         f"{' '.join(sentences)}",
@@ -178,6 +180,7 @@ def _make_drift_finding(
     ``filter_labels`` are the filters whose position error exceeds their reported σ.
     """
     loop, drift_text, rmse_sentence = find_usable_loop(analysis), rmse_text, ""
+    # State the closure error first if it shows the drift: true end known, path from odometry
     if (
         loop is not None
         and not (loop.is_end_assumed or loop.is_absolute_track)

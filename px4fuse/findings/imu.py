@@ -15,7 +15,14 @@ from px4fuse.filter.hypotheses import (
 )
 from px4fuse.filter.signals import Segment, cut_to_segment, find_imu_gaps
 from px4fuse.finding import MIN_SPAN_S
-from px4fuse.findings.model import Findings, finding, format_percent, make_error, make_warning
+from px4fuse.findings.model import (
+    Findings,
+    error_if,
+    finding,
+    format_percent,
+    make_error,
+    make_warning,
+)
 from px4fuse.findings.recording import DEFAULT_SDLOG_PROFILE, VISION_PROFILE_MASK
 from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, sample_rate
 
@@ -99,18 +106,17 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
             )
         sensor_text = "accelerometers and the level horizon"
     elif ekf2_bias_m_s2 is not None:
-        # The first branch reports a significant horizontal bias that is estimated from the
-        # positions. Here, this estimate is not significant or missing. If it is not significant,
-        # test only EKF2's estimate of the vertical bias
-        is_horizontal_bias_estimated = isinstance(systematic_errors, SystematicErrors)
-        bias_m_s2 = float(np.linalg.norm(ekf2_bias_m_s2[2 * is_horizontal_bias_estimated :]))
-        forward, right, down = ekf2_bias_m_s2
+        forward, right, down = tested_bias_m_s2 = ekf2_bias_m_s2
+        # The positions show no significant horizontal bias: test only the vertical bias
+        if isinstance(systematic_errors, SystematicErrors):
+            tested_bias_m_s2 = [down]
+        bias_m_s2 = float(np.linalg.norm(tested_bias_m_s2))
         message = (
             f"EKF2 estimates an accelerometer bias of {bias_m_s2:.2f} m/s²: {forward:+.2f} "
             f"forward, {right:+.2f} right and {down:+.2f} down."
         )
         min_severe_bias_m_s2 = np.inf  # a bias that EKF2 estimates does not affect EKF2
-    else:
+    else:  # test the vertical bias with the heights of the source
         error_m_s2 = 0.0
         if (result := analysis.axes.get("down")) is not None:
             error_m_s2 = estimate_mean_acceleration_error(result.axis) or 0.0
@@ -122,7 +128,7 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
         )
     if bias_m_s2 >= MIN_BIAS_M_S2:
         yield finding(
-            "error" if bias_m_s2 >= min_severe_bias_m_s2 else "warning",
+            error_if(bias_m_s2 >= min_severe_bias_m_s2),
             "accelerometer_bias",
             f"{message} KF does not estimate biases.",
             f"Calibrate the {sensor_text} at the temperature of the flight.",

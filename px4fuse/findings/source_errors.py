@@ -31,7 +31,9 @@ from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.findings.model import (
     WHITE_TO_ASSUMED_NOISE_RATIO_KEY,
     Findings,
+    error_if,
     find_source_texts,
+    finding,
     format_percent,
     make_error,
     make_note,
@@ -140,7 +142,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         f"correlation time {time_text}. The remaining error is white noise of "
         f"{noise.white_m:.2g} m (1 σ). KF and EKF2 assume independent errors: both follow the "
         "correlated error, and their σ is too small.",
-        f"{find_source_texts(analysis.source).slow_error_check}.",
+        f"{find_source_texts(analysis).slow_error_check}.",
         evidence,
     )
 
@@ -163,7 +165,8 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
     count, fraction = int(is_repeated.sum()), float(is_repeated.mean())
     if count < MIN_REPEATED_POSITION_COUNT or fraction < MIN_REPEATED_FRACTION:
         return
-    yield (make_error if fraction >= MIN_REPEATED_FRACTION_FOR_ERROR else make_warning)(
+    yield finding(
+        error_if(fraction >= MIN_REPEATED_FRACTION_FOR_ERROR),
         "source_samples_repeated",
         f"{count} of {len(is_repeated)} {analysis.source.positions_text} repeat the previous "
         f"position ({format_percent(fraction)}). KF and EKF2 use each repetition as a measurement.",
@@ -192,7 +195,7 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
         or noisy_sigma_low_m <= quiet_sigma_high_m
     ):
         return
-    action = f"{find_source_texts(analysis.source).slow_error_check}."
+    action = f"{find_source_texts(analysis).slow_error_check}."
     evidence = {"smaller_noise_sigma_z_m": quiet_sigma_m, "larger_noise_sigma_z_m": noisy_sigma_m}
     if noisy_axis in analysis.axes:
         action += (
@@ -223,19 +226,16 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
         < MIN_NOISY_PART_SIGMA_RATIO_WITHOUT_OUTLIERS
     ):
         return
-    noise_ratio, start_s, end_s = (
-        noisy_flight_part.sigma_ratio,
-        noisy_flight_part.start_s,
-        noisy_flight_part.end_s,
-    )
-    yield (make_error if noise_ratio >= MIN_NOISY_PART_SIGMA_RATIO_FOR_ERROR else make_warning)(
+    start_s, end_s = noisy_flight_part.start_s, noisy_flight_part.end_s
+    yield finding(
+        error_if(noisy_flight_part.sigma_ratio >= MIN_NOISY_PART_SIGMA_RATIO_FOR_ERROR),
         "source_noise_varies",
-        f"{analysis.source.kind_name} noise is {noise_ratio:.1f} times larger from "
-        f"{start_s:.0f} to {end_s:.0f} s. Single outliers are not the cause.",
-        f"{find_source_texts(analysis.source).data_link_check} for the time from {start_s:.0f} to "
+        f"{analysis.source.kind_name} noise is {noisy_flight_part.sigma_ratio:.1f} times larger "
+        f"from {start_s:.0f} to {end_s:.0f} s. Single outliers are not the cause.",
+        f"{find_source_texts(analysis).data_link_check} for the time from {start_s:.0f} to "
         f"{end_s:.0f} s. Send a variance with each position, or analyse the noisy part separately "
         "(--start, --end).",
-        {"ratio": noise_ratio, "first_s": start_s, "until_s": end_s},
+        {"ratio": noisy_flight_part.sigma_ratio, "first_s": start_s, "until_s": end_s},
         ((start_s, end_s),),
     )
 
@@ -243,7 +243,8 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
 def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResiduals) -> Findings:
     jitter_s, clock_map = find_timestamp_jitter(local_residuals), analysis.source.clock_map
     if jitter_s is not None and (clock_map is None or clock_map.distinct_stamps is None):
-        yield (make_error if jitter_s >= MIN_JITTER_FOR_ERROR_S else make_warning)(
+        yield finding(
+            error_if(jitter_s >= MIN_JITTER_FOR_ERROR_S),
             "source_timestamp_jitter",
             f"The timestamps of the {analysis.source.positions_text} jitter by "
             f"{1e3 * jitter_s:.0f} ms (1 σ). At 1 m/s this is a position error of "
@@ -271,17 +272,14 @@ def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: Err
     periodic_error = find_periodic_error(error_fit)
     positions_text = analysis.source.positions_text
     if periodic_error is not None:
-        yield (
-            make_error
-            if periodic_error.amplitude_m >= MIN_SEVERE_PERIODIC_ERROR_M
-            else make_warning
-        )(
+        yield finding(
+            error_if(periodic_error.amplitude_m >= MIN_SEVERE_PERIODIC_ERROR_M),
             "source_error_periodic",
             f"The error of the {positions_text} is periodic: amplitude "
             f"{format_metres(periodic_error.amplitude_m)} m, period {periodic_error.period_s:.1f} "
             f"s. This sinusoid explains {format_percent(min(periodic_error.fraction, 1.0))} of the "
             "slow errors against ground truth. Innovations hardly show this error.",
-            f"{find_source_texts(analysis.source).slow_error_check}. Look for a process with this "
+            f"{find_source_texts(analysis).slow_error_check}. Look for a process with this "
             "period, such as a control loop.",
             periodic_error._asdict(),
         )
@@ -312,7 +310,7 @@ def detect_scale_error(analysis: Analysis, error_fit: ErrorFit) -> Findings:
             error_fit.scale,
             error_fit.scale_error_sigma,
             f"ground truth (± {format_percent(1.96 * error_fit.scale_error_sigma, 1)}, 95 %)",
-            f"{find_source_texts(analysis.source).scale_check}.",
+            f"{find_source_texts(analysis).scale_check}.",
         )
 
 

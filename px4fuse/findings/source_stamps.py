@@ -13,9 +13,10 @@ from px4fuse.ekf2.intervals import MAX_DELAY_BEHIND_HORIZON_S
 from px4fuse.findings.model import (
     Findings,
     compute_flag_fraction,
+    error_if,
+    finding,
     format_percent,
     make_error,
-    make_note,
     make_warning,
 )
 from px4fuse.flight.ekf2_parameters import EV_POS
@@ -177,13 +178,16 @@ def detect_arrival_timestamps(analysis: Analysis) -> Findings:
     timesync_convergence = find_timesync_convergence(analysis)
     if timesync_convergence is not None:
         convergence_time_s, latency_s = timesync_convergence
-        make_finding = make_error if latency_s >= MIN_LATENCY_FOR_ERROR_S else make_warning
-        airborne = analysis.flight.airborne
+        severity, airborne = (
+            error_if(latency_s >= MIN_LATENCY_FOR_ERROR_S),
+            analysis.flight.airborne,
+        )
         if not isinstance(airborne, Unavailable) and all(
             start >= convergence_time_s for start, _ in airborne
         ):
-            make_finding = make_note
-        yield make_finding(
+            severity = "note"
+        yield finding(
+            severity,
             "source_timestamps_are_arrival_times",
             f"Position timestamps are arrival times until {convergence_time_s:.1f} s, when "
             "TIMESYNC converged (PX4 needs 500 answers). Later timestamps are times of "
@@ -217,10 +221,6 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
         float(age_s.median())
         for age_s in (position_age_s.iloc[:sample_count], position_age_s.iloc[-sample_count:])
     )
-    change_verb = "grows"
-    correlation_with_time = rank_correlation(
-        position_age_s.index.to_numpy(), position_age_s.to_numpy()
-    )
     ekf2, late_drop_sentence, dropped_fraction = analysis.flight.ekf2, "", 0.0
     if isinstance(ekf2, Ekf2) and isinstance(ekf2.horizon_s, float):
         delay_s = 1e-3 * analysis.flight.log.parameters.get(EV_POS.delay, 0.0)
@@ -232,14 +232,19 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
         )
     is_any_dropped = dropped_fraction > MIN_DROPPED_POSITION_FRACTION
     if (
-        final_latency_s - initial_latency_s < MIN_LATENCY_FOR_ERROR_S
-        or correlation_with_time < MIN_LATENCY_CORRELATION
+        final_latency_s - initial_latency_s >= MIN_LATENCY_FOR_ERROR_S
+        and rank_correlation(position_age_s.index.to_numpy(), position_age_s.to_numpy())
+        >= MIN_LATENCY_CORRELATION
     ):
-        if not is_any_dropped or dropped_fraction >= 1.0 - MIN_DROPPED_POSITION_FRACTION:
-            return
+        change_verb = "grows"
+    # If EKF2 drops nearly all positions, the latency is constant and too long, but does not vary
+    elif is_any_dropped and dropped_fraction < 1.0 - MIN_DROPPED_POSITION_FRACTION:
         change_verb = "varies"
         initial_latency_s, final_latency_s = position_age_s.quantile([0.05, 0.95]).tolist()
-    yield (make_error if is_any_dropped else make_warning)(
+    else:
+        return
+    yield finding(
+        error_if(is_any_dropped),
         "source_latency_varies",
         f"The latency of the {analysis.source.positions_text} {change_verb} in flight from "
         f"{initial_latency_s:.2f} s to {final_latency_s:.2f} s (time from measurement to arrival)."
