@@ -68,6 +68,14 @@ class PositionTable:
     has_only_chosen_body: bool = False
     notes: tuple[str, ...] = ()
 
+    def describe_format(self) -> str:
+        """Describe the file format, or separator and header of a table with a header."""
+        if self.format:
+            return f"the file format is {self.format}"
+        return (
+            f"the separator is {SEPARATORS[self.separator]}, the header is line {self.header_line}"
+        )
+
     def format_labels(self, *columns: int | None) -> str:
         """Join the names of columns for a message to the user."""
         labels = dict.fromkeys(
