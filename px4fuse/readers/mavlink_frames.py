@@ -268,7 +268,8 @@ def _find_possible_frames(content: bytes, block_start: int) -> Int64Array:
     is_possible = (
         (flags <= SIGNED_FLAG) & (_CRC_EXTRA[message_ids] >= 0) & (end_offsets <= len(content))
     )
-    return np.column_stack([start_offsets, end_offsets, message_ids, crc_offsets])[is_possible]
+    frames = np.stack([start_offsets, end_offsets, message_ids, crc_offsets], axis=1)
+    return np.asarray(frames[is_possible])
 
 
 def _has_receive_times(start_offsets: Int64Array, end_offsets: Int64Array) -> bool:
