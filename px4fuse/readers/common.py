@@ -119,12 +119,15 @@ def collect_unavailable(*flight_data: object) -> tuple[Unavailable, ...]:
     return tuple(data for data in flight_data if isinstance(data, Unavailable))
 
 
-def find_flight_spans(landed_flags: pd.Series, duration_s: float) -> Spans:
-    """Return start and end (s) of each flight, from the flags of the land detector."""
-    landed_changes = landed_flags[landed_flags.ne(landed_flags.shift())]
-    start_times_s = np.maximum.accumulate(np.maximum(landed_changes.index.to_numpy(), 0.0)).tolist()
-    spans = zip(start_times_s, [*start_times_s[1:], duration_s], landed_changes, strict=False)
-    return tuple((start, end) for start, end, is_landed in spans if end > start and not is_landed)
+def find_spans(flags: pd.Series, duration_s: float) -> Spans:
+    """Return start and end (s) of each span in which a flag is set, up to the end of the data.
+
+    Each value of the flag is valid until the next value. Times before 0 are replaced by 0.
+    """
+    changes = flags[flags.ne(flags.shift())]
+    start_times_s = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0)).tolist()
+    spans = zip(start_times_s, [*start_times_s[1:], duration_s], changes, strict=False)
+    return tuple((start, end) for start, end, is_set in spans if is_set and end > start)
 
 
 def ends_in_flight(airborne: Spans | Unavailable, duration_s: float) -> bool:

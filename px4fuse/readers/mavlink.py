@@ -243,8 +243,8 @@ def _read_airborne_spans(recording: Recording) -> Spans | Unavailable:
     recording.record_stream("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK_TEXT)
     rows = recording.rows("EXTENDED_SYS_STATE")[is_known]
     time_s = recording.compute_receipt_boot_times_s(rows) - recording.time_origin_s
-    is_landed = pd.Series(landed_states[is_known] == ON_GROUND_STATE, time_s)
-    return common.find_flight_spans(is_landed, recording.duration_s)
+    is_airborne = pd.Series(landed_states[is_known] != ON_GROUND_STATE, time_s)
+    return common.find_spans(is_airborne, recording.duration_s)
 
 
 def _read_parameters(recording: Recording) -> dict[str, float]:

@@ -464,29 +464,25 @@ def _read_parameters(
     ulog: ULog, tables: Tables, time_origin_us: int
 ) -> tuple[dict[str, float], tuple[ParameterChange, ...]]:
     """Return the parameters at take-off, and later changes of EKF2 parameters."""
-    parameter_values = {
-        name: float(value)
-        for name, value in ulog.initial_parameters.items()
-        if isinstance(value, int | float)
-    }
     land_detector, take_off_time_us = tables.get(("vehicle_land_detected", 0), {}), 0
     landed = land_detector.get("landed")
     if landed is not None and not landed.all():
-        take_off_time_us = int(land_detector["timestamp"][np.argmin(landed)])
-    parameter_changes: list[ParameterChange] = []
-    last_parameter_values = parameter_values.copy()
-    for time_us, name, value in sorted(ulog.changed_parameters, key=lambda change: change[0]):
+        # Time of the first sample with landed = 0
+        take_off_time_us = int(land_detector["timestamp"][landed.argmin()])
+    values_at_take_off, last_values, changes = dict[str, float](), dict[str, float](), []
+    time_us_and_parameters = [(0, *parameter) for parameter in ulog.initial_parameters.items()]
+    time_us_and_parameters += sorted(ulog.changed_parameters, key=lambda change: change[0])
+    for time_us, name, value in time_us_and_parameters:
         if not isinstance(value, int | float):
             continue
-        if time_us <= take_off_time_us or name not in parameter_values:
-            parameter_values[name] = float(value)
-        elif name.startswith("EKF2_") and last_parameter_values[name] != value:
+        # The first logged value of a parameter is also its value at take-off
+        if time_us <= take_off_time_us or name not in last_values:
+            values_at_take_off[name] = float(value)
+        elif name.startswith("EKF2_") and value != last_values[name]:
             time_s = (time_us - time_origin_us) * _MICROSECOND_S
-            parameter_changes.append(
-                ParameterChange(time_s, name, last_parameter_values[name], float(value))
-            )
-        last_parameter_values[name] = float(value)
-    return parameter_values, tuple(parameter_changes)
+            changes.append(ParameterChange(time_s, name, last_values[name], float(value)))
+        last_values[name] = float(value)
+    return values_at_take_off, tuple(changes)
 
 
 def _read_tables(ulog: ULog) -> Tables:
