@@ -221,7 +221,7 @@ def estimate_quantisation_step(values: Array) -> float:
 
 def interpolate_inside_time_span(time_s: pd.Index | Array, values: "pd.Series[float]") -> Array:
     """Interpolate a time series at the given times; NaN outside its time span."""
-    return np.asarray(np.interp(time_s, values.index, values, left=np.nan, right=np.nan))
+    return np.asarray(np.interp(time_s, values.index, values, np.nan, np.nan))
 
 
 def join_nearest(

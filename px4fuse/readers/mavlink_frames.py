@@ -54,10 +54,10 @@ VEHICLE_TYPES = {
 } | {6: "ground station", 18: "companion computer"}
 # CRC_EXTRA byte of the checksum by message id; -1 for unknown messages. All known ids have 16 bits.
 # The last element is for all ids with 24 bits
-_CRC_EXTRA = np.full((1 << 16) + 1, -1, dtype=np.int16)
+_CRC_EXTRA = np.full((1 << 16) + 1, -1, np.int16)
 _CRC_EXTRA[[*dialect.mavlink_map]] = [message.crc_extra for message in dialect.mavlink_map.values()]
 # CRC of each byte value
-_CRC_TABLE = np.array([mcrf4xx(bytes([byte]), 0) for byte in range(256)], dtype=np.uint16)
+_CRC_TABLE = np.array([mcrf4xx(bytes([byte]), 0) for byte in range(256)], np.uint16)
 
 
 @dataclass(frozen=True)
@@ -107,8 +107,8 @@ class MavlinkFrames:
         omits trailing zero bytes of the payload. They are added again.
         """
         layout = wire_layout(MESSAGE_IDS[message])
-        payload = np.zeros((len(rows), layout.itemsize), dtype=np.uint8)
-        content_bytes = np.frombuffer(self.content, dtype=np.uint8)
+        payload = np.zeros((len(rows), layout.itemsize), np.uint8)
+        content_bytes = np.frombuffer(self.content, np.uint8)
         payload_starts = self.payload_offsets[rows]
         payload_lengths = self.payload_lengths[rows]
         for length in np.unique(payload_lengths).tolist():
@@ -168,7 +168,7 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
     receive_time_size_bytes = (
         RECEIVE_TIME_BYTES if _has_receive_times(start_offsets, end_offsets) else 0
     )
-    content_bytes = np.frombuffer(content, dtype=np.uint8)
+    content_bytes = np.frombuffer(content, np.uint8)
     is_version_2 = content_bytes[start_offsets] == MAGIC_BYTE_V2
     sequence_offsets = start_offsets + np.where(
         is_version_2, SEQUENCE_OFFSET_V2, SEQUENCE_OFFSET_V1
@@ -200,7 +200,7 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
 
 def _find_valid_frames(content: bytes) -> Int64Array:
     """Return start, end and message id of each frame with a valid checksum, shape (n, 3)."""
-    content_bytes = np.frombuffer(content, dtype=np.uint8)
+    content_bytes = np.frombuffer(content, np.uint8)
     content_view = memoryview(content)
     valid_frames = []
     for block_start in range(0, len(content) + 1, BLOCK_BYTES):
@@ -210,7 +210,7 @@ def _find_valid_frames(content: bytes) -> Int64Array:
         byte_ranges = zip((start_offsets + 1).tolist(), crc_offsets.tolist(), strict=True)
         crc = np.array(
             [mcrf4xx(content_view[first_byte:end_byte]) for first_byte, end_byte in byte_ranges],
-            dtype=np.uint16,
+            np.uint16,
         )
         crc = (crc >> 8) ^ _CRC_TABLE[(crc ^ _CRC_EXTRA[message_ids]) & 0xFF]
         stored_crc = content_bytes[crc_offsets] | content_bytes[crc_offsets + 1].astype(int) << 8
@@ -248,7 +248,7 @@ def _find_possible_frames(content: bytes, block_start: int) -> Int64Array:
     byte_count = BLOCK_BYTES + HEADER_BYTES_V2 - 1
     block = content[block_start : block_start + byte_count].ljust(byte_count, b"\0")
     headers = np.lib.stride_tricks.sliding_window_view(
-        np.frombuffer(block, dtype=np.uint8), HEADER_BYTES_V2
+        np.frombuffer(block, np.uint8), HEADER_BYTES_V2
     )
     rows = np.flatnonzero((headers[:, 0] == MAGIC_BYTE_V1) | (headers[:, 0] == MAGIC_BYTE_V2))
     headers = headers[rows].astype(np.int32)

@@ -270,7 +270,7 @@ class Recording:
         if not self.receive_to_boot_time_fit.reading_pair_count:
             return self.compute_receipt_boot_times_s(rows)
         if "time_boot_ms" in (table.dtype.names or ()):
-            return np.asarray(table["time_boot_ms"] * 1e-3)
+            return table["time_boot_ms"] * 1e-3
         timestamp_s: Array = table["time_usec"] * 1e-6
         # time_usec is boot time or UNIX time; both are valid if the origin has the same clock
         is_boot_time = (timestamp_s > 0.0) & (

@@ -6,10 +6,10 @@ The positions keep the clock and the coordinate frame of the file.
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -59,19 +59,10 @@ MAX_UNIX_TIME_INTERVAL_S = 60.0
 MAX_INDOOR_EXTENT_M = 200.0
 # Maximum absolute coordinate; larger values are timestamps or damaged text
 MAX_COORDINATE_IN_FILE_UNIT = 1e9
-
-
-class PlausibleTimes(NamedTuple):
-    """Plausible time units, and minimum and maximum median interval (s) between positions."""
-
-    units: tuple[str, ...]
-    min_interval_s: float
-    max_interval_s: float
-
-
-# 0.2 to 200 UWB positions per second, ±10 %
-UWB_TIMES = PlausibleTimes((*SECONDS_BY_TIME_UNIT,), 0.9 / 200, 1.1 / 0.2)
-TRAJECTORY_TIMES = PlausibleTimes(("s", "ns"), 1e-3, 1e3)
+# Plausible time units, with minimum and maximum median interval (s): 0.2 to 200 UWB positions per
+# second, ±10 %
+UWB_INTERVALS_S = dict.fromkeys(SECONDS_BY_TIME_UNIT, (0.9 / 200, 1.1 / 0.2))
+TRAJECTORY_INTERVALS_S = dict.fromkeys(("s", "ns"), (1e-3, 1e3))
 
 
 @dataclass(frozen=True)
@@ -171,13 +162,13 @@ def read_position_file(
     numbers = numbers[has_time & has_position]
 
     # Convert the times to seconds, and select the rows with increasing times
-    plausible_times = TRAJECTORY_TIMES if is_trajectory else UWB_TIMES
+    plausible_intervals_s = TRAJECTORY_INTERVALS_S if is_trajectory else UWB_INTERVALS_S
     unit, unit_reason = _choose_time_unit(
         numbers[time_column],
         table.rate_hz,
         column_meanings[time_column].unit,
         time_unit,
-        plausible_times,
+        plausible_intervals_s,
     )
     units_per_second = table.rate_hz or round(1.0 / SECONDS_BY_TIME_UNIT[unit])
     times_s = numbers[time_column].to_numpy() / units_per_second
@@ -190,7 +181,8 @@ def read_position_file(
     numbers = numbers.iloc[increasing_rows].set_index(time_index(times_s[increasing_rows]))
     _check_row_count(table, len(numbers), row_count, notes)
     median_interval_s = compute_median_interval_s(numbers.index)
-    if not plausible_times.min_interval_s <= median_interval_s <= plausible_times.max_interval_s:
+    min_interval_s, max_interval_s = plausible_intervals_s["s"]
+    if not min_interval_s <= median_interval_s <= max_interval_s:
         notes.append(
             f"a median interval of {median_interval_s:.3g} s is unusual: check the unit of time "
             "(--position-time-unit)"
@@ -221,7 +213,6 @@ def read_position_file(
     reasons_without_position = pd.Series("NaN", times_without_position / units_per_second)
     reason_by_invalid_row = pd.concat([invalid_reasons[~is_valid], reasons_without_position])
 
-    height_text = "" if len(position_columns) == 3 else " without height"
     return PositionRecording(
         name=table.file_name,
         sha256=sha256,
@@ -234,7 +225,8 @@ def read_position_file(
             table.describe_format(),
             f"time: column {time_text}, {clock_kind} clock, unit {unit} ({unit_reason})",
             f"position: columns {table.format_labels(*axis_columns)} as "
-            f"{frame.upper() if frame else 'x, y, z'}{height_text}, unit {length_unit_text}",
+            f"{frame.upper() if frame else 'x, y, z'}"
+            f"{'' if len(position_columns) == 3 else ' without height'}, unit {length_unit_text}",
             f"sigma: columns {table.format_labels(*sigma_columns) or 'none'}",
         ),
         notes=tuple(notes),
@@ -481,7 +473,7 @@ def _choose_time_unit(
     frame_rate_hz: float | None,
     unit_in_column_name: str,
     given_unit: str | None,
-    plausible_times: PlausibleTimes,
+    plausible_intervals_s: Mapping[str, tuple[float, float]],
 ) -> tuple[str, str]:
     """Return the unit of the timestamps, and the reason for this unit.
 
@@ -502,11 +494,10 @@ def _choose_time_unit(
         interval_s = median_step * unit_s
         if is_unix and interval_s <= MAX_UNIX_TIME_INTERVAL_S:
             return unit, "in this unit, the timestamps are UNIX times between 2000 and 2100"
-        if (
-            unit in plausible_times.units
-            and plausible_times.min_interval_s <= interval_s <= plausible_times.max_interval_s
-        ):
-            plausible_units.append(unit)
+        if unit in plausible_intervals_s:
+            min_interval_s, max_interval_s = plausible_intervals_s[unit]
+            if min_interval_s <= interval_s <= max_interval_s:
+                plausible_units.append(unit)
     if not plausible_units:
         return "s", (
             "px4fuse assumes seconds, because no unit gives a plausible UWB rate; set another unit "

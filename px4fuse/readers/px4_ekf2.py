@@ -242,7 +242,7 @@ def _estimate_step_s(topics: Topics) -> float:
 def find_rows_of_timestamps(times_s: Array, wanted_times_s: ArrayLike) -> IntArray:
     """Return the indices of ``times_s`` (increasing) that equal a wanted time, rounded to 1 µs."""
     times_us, wanted_times_us = (
-        np.rint(np.asarray(times, float) * 1e6) for times in (times_s, wanted_times_s)
+        np.rint(np.multiply(times, 1e6)) for times in (times_s, wanted_times_s)
     )
     rows = np.searchsorted(times_us, wanted_times_us)
     is_inside = rows < len(times_us)
@@ -267,7 +267,7 @@ def compute_samples_per_step(
     interval_ratio = configured_step_s / imu_interval_s
     # 1e-6 compensates rounding errors of the IMU interval
     sample_count = max(int(interval_ratio + 0.5 + 1e-6), 1)
-    samples_between_logged_ends = np.diff(np.asarray(step_ends))
+    samples_between_logged_ends = np.diff(step_ends)
     if (
         sample_count > 1
         and abs(interval_ratio + 0.5 - sample_count) < MAX_DISTANCE_FROM_HALF_INTEGER
