@@ -597,7 +597,7 @@ class AidLog:
 def sample_step_function(step_function: pd.Series[float], times: pd.Index[float] | Array) -> Array:
     """Return the values of a step function at the given times."""
     previous_rows = np.clip(np.searchsorted(step_function.index, times, side="right") - 1, 0, None)
-    return step_function.to_numpy(np.float64)[previous_rows]
+    return np.asarray(step_function, np.float64)[previous_rows]
 
 
 class ParameterChange(NamedTuple):
