@@ -166,14 +166,12 @@ def classify_invalid_positions(samples: pd.DataFrame, columns: list[str]) -> "pd
     is_number: BoolArray = (np.abs(values) < MAX_VALID_SI_VALUE).all(axis=1)
     reason_by_row[~is_number] = "NaN"
     is_zero: BoolArray = (values == 0.0).all(axis=1)
-    nonzero_rows, zero_rows = np.flatnonzero(is_number & ~is_zero), np.flatnonzero(is_zero)
-    if len(nonzero_rows):
-        next_index = np.searchsorted(nonzero_rows, zero_rows)
-        neighbour_rows = nonzero_rows[
-            np.clip([next_index - 1, next_index], 0, len(nonzero_rows) - 1)
-        ]
-        distance_m = np.linalg.norm(values[neighbour_rows], axis=2).min(axis=0)
-        reason_by_row.iloc[zero_rows[distance_m > MIN_DISTANCE_OF_INVALID_ZERO_POSITION_M]] = "zero"
+    # Distance of 0, 0, 0 from the previous and from the next position
+    positions = pd.DataFrame(np.where((is_number & ~is_zero)[:, None], values, np.nan))
+    previous_distance_m = np.linalg.norm(positions.ffill(), axis=1)
+    next_distance_m = np.linalg.norm(positions.bfill(), axis=1)
+    distance_m = np.fmin(previous_distance_m, next_distance_m)
+    reason_by_row[is_zero & (distance_m > MIN_DISTANCE_OF_INVALID_ZERO_POSITION_M)] = "zero"
     valid_rows = np.flatnonzero(reason_by_row == "")
     if len(valid_rows):
         offset_from_median_m = values[valid_rows] - np.median(values[valid_rows], axis=0)

@@ -125,8 +125,9 @@ def _read_imu(recording: Recording) -> TableOrUnavailable:
         layout = recording.find_most_frequent(IMU_LAYOUTS)
     rows = recording.rows(layout.topic)
     if layout == HIGHRES_IMU_LAYOUT:
-        imu_ids = np.array(recording.frames.table(layout.topic, rows)["id"])
-        rows = rows[np.isin(imu_ids, pd.Series(imu_ids).mode()[:1])]
+        imu_ids = recording.frames.table(layout.topic, rows)["id"]
+        most_frequent_id = np.bincount(imu_ids, minlength=1).argmax()
+        rows = rows[imu_ids == most_frequent_id]
     imu = recording.read(layout, rows)
     imu = common.select_valid_rows(imu, imu.columns.tolist(), common.MAX_IMU_READING)
     if len(imu) < 2:

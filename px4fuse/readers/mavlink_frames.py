@@ -352,14 +352,12 @@ def _read_receive_times(
     is_usable &= (receive_times_us >= 0) & (receive_times_us < 1 << 62)
     median_receive_time_us = int(np.median(receive_times_us[is_usable])) if np.any(is_usable) else 0
     is_usable &= np.abs(receive_times_us - median_receive_time_us) <= MAX_RECEIVE_TIME_DIFFERENCE_US
-    receive_times_us = np.where(is_usable, receive_times_us, 0)
-    if np.any(is_usable):
-        rows = np.flatnonzero(is_usable)
-        # Interpolate times relative to the first, so that float64 resolves microseconds
-        time_since_first_receipt_us = np.interp(
-            np.arange(len(start_offsets)), rows, receive_times_us[rows] - receive_times_us[rows[0]]
-        )
-        receive_times_us = receive_times_us[rows[0]] + np.rint(time_since_first_receipt_us).astype(
-            np.int64
-        )
-    return receive_times_us
+    rows = np.flatnonzero(is_usable)
+    if not len(rows):
+        return np.zeros_like(receive_times_us)
+    # Interpolate times relative to the first, so that float64 resolves microseconds
+    first_time_us = receive_times_us[rows[0]]
+    time_since_first_us = np.interp(
+        np.arange(len(start_offsets)), rows, receive_times_us[rows] - first_time_us
+    )
+    return np.asarray(first_time_us + np.rint(time_since_first_us).astype(np.int64))

@@ -74,7 +74,8 @@ def read_ulog(name: str, content: bytes) -> Flight:
     barometer_delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
     is_in_flight = common.ends_in_flight(airborne_spans_s, topics.log.duration_s)
     dropped_counts = dict(sorted(topics.dropped.items()))
-    tilt_failure_flags = topics.read(TOPIC_LAYOUTS["failure_detector_status"])
+    # Flags of the failure detector for roll and pitch
+    has_excessive_tilt = topics.read(TOPIC_LAYOUTS["failure_detector_status"]).any(axis=1)
     return Flight(
         log=structs.replace(
             topics.log,
@@ -90,9 +91,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
         ekf2=ekf2,
         truth=truth,
         airborne=airborne_spans_s,
-        excessive_tilt_spans_s=common.find_spans(
-            tilt_failure_flags.any(axis=1), topics.log.duration_s
-        ),
+        excessive_tilt_spans_s=common.find_spans(has_excessive_tilt, topics.log.duration_s),
         barometer=barometer(altitude_m, barometer_delay_s),
         missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *unavailable_positions),
         streams=topics.data_source_by_kind,
