@@ -117,17 +117,17 @@ def fit_clock_line(x: Array, y: Array) -> ClockLine:
             for interval_rows in rows_by_interval
         ]
         if fit_number < 2 and span_s >= MIN_DRIFT_SPAN_S:
-            slope = _fit_clock_rate(x[rows], y[rows])
+            slope = _fit_clock_rate(x[rows], relative_delay_s[rows], slope)
     y0 = float(np.median(relative_delay_s[rows]))
     return ClockLine(x0, y0, slope, robust_std(relative_delay_s), len(x))
 
 
-def _fit_clock_rate(x: Array, y: Array) -> float:
-    """Return the Theil-Sen slope of y over x; 1 if it is not plausible."""
+def _fit_clock_rate(x: Array, y: Array, added_rate: float = 0.0) -> float:
+    """Return the Theil-Sen slope of y over x plus ``added_rate``; 1 if it is not plausible."""
     if len(x) < 2 or x[0] == x[-1]:
         return 1.0
     with np.errstate(over="ignore", invalid="ignore"):
-        rate = float(theilslopes(y, x)[0])
+        rate = float(theilslopes(y, x)[0]) + added_rate
     return rate if 1.0 / MAX_RATIO_OF_CLOCK_RATES < rate < MAX_RATIO_OF_CLOCK_RATES else 1.0
 
 
