@@ -22,19 +22,12 @@ _input_path_by_file_id: ContextVar[dict[_FileIdentity | None, Path] | None] = Co
 
 
 @contextmanager
-def protect_inputs() -> Iterator[None]:
-    """Register all files that are read in this context, so that no output overwrites them."""
-    context_token = _input_path_by_file_id.set({})
-    try:
-        yield
-    finally:
-        _input_path_by_file_id.reset(context_token)
+def protect_inputs(*, is_active: bool = True) -> Iterator[None]:
+    """Register all files that are read in this context, so that no output overwrites them.
 
-
-@contextmanager
-def suspend_input_registration() -> Iterator[None]:
-    """Allow outputs to overwrite files that are read in this context."""
-    context_token = _input_path_by_file_id.set(None)
+    If ``is_active`` is False, outputs may overwrite files that are read in this context.
+    """
+    context_token = _input_path_by_file_id.set({} if is_active else None)
     try:
         yield
     finally:

@@ -27,6 +27,8 @@ else:
 max_log_bytes: ContextVar[int] = ContextVar("max_log_bytes", default=2_000_000_000)
 #: Folders that ``px4fuse mcp`` may read (option ``--root``); all folders if empty
 readable_folders: ContextVar[tuple[Path, ...]] = ContextVar("readable_folders", default=())
+# Byte order marks of UTF-16, the encoding of texts from Windows shells
+UTF_16_BYTE_ORDER_MARKS = (b"\xff\xfe", b"\xfe\xff")
 LOG_SIZE_REMEDY = (
     "Cut the log to the time span of the flight, or increase the size limit with --max-size MB."
 )
@@ -165,9 +167,9 @@ def read_text(
     content = read_bytes_limited(
         path, error_type, limit_bytes, name=name, remedy_if_too_large=remedy_if_too_large
     )
-    is_utf16 = content.startswith((b"\xff\xfe", b"\xfe\xff"))
+    is_utf_16 = content.startswith(UTF_16_BYTE_ORDER_MARKS)
     try:
-        return content.decode("utf-16" if is_utf16 else "utf-8-sig")
+        return content.decode("utf-16" if is_utf_16 else "utf-8-sig")
     except UnicodeDecodeError as error:
         raise error_type(
             f"{name} is not a text file in UTF-8: the byte at position {error.start} is invalid.",

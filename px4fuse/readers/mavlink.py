@@ -224,10 +224,7 @@ def _compute_variance_from_accuracy(recording: Recording) -> pd.DataFrame:
     PX4's horizontal accuracy is √(σ_north² + σ_east²) (``get_ekf_lpos_accuracy``).
     """
     accuracy = recording.read(MESSAGE_LAYOUTS["ESTIMATOR_STATUS"])
-    horizontal_variance_m2 = accuracy["horizontal_m"] ** 2 / 2.0
-    variance = pd.concat(
-        [horizontal_variance_m2, horizontal_variance_m2, accuracy["vertical_m"] ** 2], axis=1
-    )
+    variance = accuracy[["horizontal_m", "horizontal_m", "vertical_m"]] ** 2 / [2.0, 2.0, 1.0]
     variance = variance[(variance > 0.0).all(axis=1)].set_axis(Columns.POSITION_VARIANCE, axis=1)
     return variance.reindex(columns=VARIANCE_COLUMNS)
 

@@ -262,39 +262,32 @@ def map_clock_to_boot(
             ),
         )
 
-    def compute_difference_from_receipt_s(boot_time_s: Array) -> float:
-        return abs(float(np.median(boot_time_at_receipt_s - boot_time_s)))
+    def compute_difference_from_receipt_s(line: ClockLine) -> float:
+        return abs(float(np.median(boot_time_at_receipt_s - line.at(timestamps_s))))
 
-    timesync_fit = _fit_timesync(sender_timesync_replies, autopilot_timesync_replies)
-    difference_from_receipt_s = compute_difference_from_receipt_s(timestamps_s)
-    # A sender clock that started only seconds after the autopilot resembles the boot clock. If
-    # TIMESYNC is available, it shows the difference
-    clock_difference_reduction_by_timesync_s = (
-        0.0
-        if timesync_fit is None
-        else difference_from_receipt_s
-        - compute_difference_from_receipt_s(timesync_fit.at(timestamps_s))
-    )
-    if (
-        difference_from_receipt_s <= MAX_BOOT_TIME_DIFFERENCE_S
-        and clock_difference_reduction_by_timesync_s < MIN_CLOCK_DIFFERENCE_REDUCTION_BY_TIMESYNC_S
-    ):
-        identity_clock_line = ClockLine(0.0, 0.0, 1.0, 0.0, len(timestamps_s))
-        note = "the timestamps of the sender are boot times of the autopilot"
-        return _make_clock_mapping(name, "boot clock", identity_clock_line, timestamps_s, note)
     clock_kind = "UNIX time" if np.median(timestamps_s) > MIN_UNIX_TIME_S else "clock"
     clock_name = f"{clock_kind} of {name}"
-    candidate_fits = [] if timesync_fit is None else [("TIMESYNC", timesync_fit, "")]
+    timesync_fit = _fit_timesync(sender_timesync_replies, autopilot_timesync_replies)
+    identity = ClockLine(0.0, 0.0, 1.0, 0.0, len(timestamps_s))
+    candidates = []
+    # A sender clock that started only seconds after the autopilot resembles the boot clock. If
+    # TIMESYNC is available, it shows the difference
+    if timesync_fit is None or (
+        compute_difference_from_receipt_s(identity)
+        - compute_difference_from_receipt_s(timesync_fit)
+        < MIN_CLOCK_DIFFERENCE_REDUCTION_BY_TIMESYNC_S
+    ):
+        note = "the timestamps of the sender are boot times of the autopilot"
+        candidates.append((name, "boot clock", identity, note))
+    if timesync_fit is not None:
+        candidates.append((clock_name, "TIMESYNC", timesync_fit, ""))
     if clock_kind == "UNIX time" and boot_to_unix_fit is not None:
-        unix_note = "assumption: the UNIX clocks of sender and autopilot are synchronised"
-        candidate_fits.append(("SYSTEM_TIME", boot_to_unix_fit.inverse(), unix_note))
-    for method, sender_to_boot_fit, note in candidate_fits:
+        note = "assumption: the UNIX clocks of sender and autopilot are synchronised"
+        candidates.append((clock_name, "SYSTEM_TIME", boot_to_unix_fit.inverse(), note))
+    for clock, method, line, note in candidates:
         # Converted timestamps that disagree with the receive times are from another clock
-        if (
-            compute_difference_from_receipt_s(sender_to_boot_fit.at(timestamps_s))
-            <= MAX_BOOT_TIME_DIFFERENCE_S
-        ):
-            return _make_clock_mapping(clock_name, method, sender_to_boot_fit, timestamps_s, note)
+        if compute_difference_from_receipt_s(line) <= MAX_BOOT_TIME_DIFFERENCE_S:
+            return _make_clock_mapping(clock, method, line, timestamps_s, note)
     sender_to_boot_fit = fit_clock_line(timestamps_s, receive_times_s)
     sender_to_boot_fit = replace(
         sender_to_boot_fit,

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.reading import display_name, read_text
+from px4fuse.core.reading import UTF_16_BYTE_ORDER_MARKS, display_name, read_text
 from px4fuse.core.record import read_toml
 from px4fuse.core.text import join_first_names
 from px4fuse.errors import LogError, Px4FuseError
@@ -37,8 +37,6 @@ HEADERLESS_TABLE_FORMAT = "table without header"
 MIN_VALID_UNIX_TIME_S, MAX_VALID_UNIX_TIME_S = 946_684_800.0, 4_102_444_800.0
 # Number of characters that are searched for signs of a binary file
 _CHECKED_CHAR_COUNT = 100_000
-# Byte order marks of UTF-16, the encoding of texts from Windows shells
-_UTF_16_BYTE_ORDER_MARKS = (b"\xff\xfe", b"\xfe\xff")
 _CONTROL_CHARACTER_PATTERN = re.compile("[\x00-\x08\x0e-\x1b]")
 _NUMBER_PATTERN = re.compile(
     r"[+-]?(?:(?:[0-9]+\.?|[0-9]*\.[0-9]+)(?:e[+-]?[0-9]+)?|nan|inf)", re.IGNORECASE
@@ -140,7 +138,7 @@ def refuse_foreign_format(path: Path, first_bytes: bytes, error_type: type[Px4Fu
 
 def decode_text(content: bytes) -> str | None:
     """Decode a text in UTF-8, UTF-16 or Latin-1, with line feeds as line ends; None if binary."""
-    if content.startswith(_UTF_16_BYTE_ORDER_MARKS):
+    if content.startswith(UTF_16_BYTE_ORDER_MARKS):
         text = content[: len(content) // 2 * 2].decode("utf-16", errors="replace")
     else:
         content = content.rstrip(b"\0\x1a")  # NUL at the end after a power loss, 0x1a from DOS
