@@ -3,6 +3,7 @@
 import errno
 import os
 import secrets
+import stat
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -70,7 +71,7 @@ def _write_output(path: Path, content: bytes) -> None:
         sys.stdout.flush()
         sys.stdout.buffer.write(content)
         sys.stdout.flush()
-    elif path.is_file() or not path.exists():
+    elif stat.S_ISREG(_read_file_mode(path)):
         _replace_file(path.resolve(), content)
     else:  # named pipe or device
         path.write_bytes(content)
@@ -82,6 +83,13 @@ def _is_standard_output(path: Path) -> bool:
         return os.path.samestat(path.stat(), os.fstat(1))
     except OSError:  # the file does not exist, or standard output is closed
         return False
+
+
+def _read_file_mode(path: Path) -> int:
+    try:
+        return path.stat().st_mode
+    except FileNotFoundError:
+        return stat.S_IFREG
 
 
 def _replace_file(target: Path, content: bytes) -> None:
