@@ -248,7 +248,7 @@ def _use_barometer_height(
             f"{log_name}: `height` needs GNSS as position source, not {track.name}."
         )
     is_barometer_ekf2_height = has_fused_aid(ekf2, BAROMETER.name) and not has_fused_aid(
-        ekf2, GNSS.vertical_aid
+        ekf2, GNSS["vertical"].aid
     )
     uses_barometer = height_sensor == "barometer" or (
         height_sensor is None and track.origin.is_fused_as_gnss and is_barometer_ekf2_height
@@ -256,7 +256,8 @@ def _use_barometer_height(
     if not uses_barometer or barometer_heights is None:
         if height_sensor == "barometer":
             raise MissingDataError(
-                f"{log_name}: the log contains no barometer height.", GNSS.logging_remedy
+                f"{log_name}: the log contains no barometer height.",
+                GNSS["vertical"].logging_remedy,
             )
         return track
     offset_m = barometer_heights["down_m"].iloc[0]

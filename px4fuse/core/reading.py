@@ -27,6 +27,8 @@ else:
 max_log_bytes: ContextVar[int] = ContextVar("max_log_bytes", default=2_000_000_000)
 #: Folders that ``px4fuse mcp`` may read (option ``--root``); all folders if empty
 readable_folders: ContextVar[tuple[Path, ...]] = ContextVar("readable_folders", default=())
+# Byte order marks of UTF-16, the encoding of texts from Windows shells
+UTF_16_BYTE_ORDER_MARKS = (b"\xff\xfe", b"\xfe\xff")
 LOG_SIZE_REMEDY = (
     "Cut the log to the time span of the flight, or increase the size limit with --max-size MB."
 )
@@ -118,15 +120,15 @@ def read_bytes_limited(
     """
     name = name or display_name(path)
     size_bytes = file_size(path, error_type, name)
-    content = (
-        b"" if size_bytes > limit_bytes else _read_bytes(path, size_bytes + 1, error_type, name)
-    )
-    if len(content) > size_bytes:  # the file has grown, or is in /proc, where the size is 0
-        content = _read_bytes(path, limit_bytes + 1, error_type, name)
-    if (actual_size_bytes := max(size_bytes, len(content))) > limit_bytes:
-        raise error_type(
-            format_size_limit(name, actual_size_bytes, limit_bytes), remedy_if_too_large
-        )
+    content = b""
+    if size_bytes <= limit_bytes:
+        # Python reserves as much memory as is requested, so the limit is not requested at once
+        content = _read_bytes(path, size_bytes + 1, error_type, name)
+        if len(content) > size_bytes:  # compressed, growing, or in /proc, where the size is 0
+            content = _read_bytes(path, limit_bytes + 1, error_type, name)
+            size_bytes = len(content)
+    if size_bytes > limit_bytes:
+        raise error_type(format_size_limit(name, size_bytes, limit_bytes), remedy_if_too_large)
     if remedy_if_empty is not None and not content:
         raise error_type(f"{name}: the file is empty", remedy_if_empty)
     return content
@@ -165,9 +167,9 @@ def read_text(
     content = read_bytes_limited(
         path, error_type, limit_bytes, name=name, remedy_if_too_large=remedy_if_too_large
     )
-    is_utf16 = content.startswith((b"\xff\xfe", b"\xfe\xff"))
+    is_utf_16 = content.startswith(UTF_16_BYTE_ORDER_MARKS)
     try:
-        return content.decode("utf-16" if is_utf16 else "utf-8-sig")
+        return content.decode("utf-16" if is_utf_16 else "utf-8-sig")
     except UnicodeDecodeError as error:
         raise error_type(
             f"{name} is not a text file in UTF-8: the byte at position {error.start} is invalid.",
@@ -216,16 +218,10 @@ def list_files_recursively(folder: Path) -> list[Path]:
     A folder that cannot be listed is returned too, so that reading it raises an error.
     """
     files: list[Path] = []
-    pending_folders = [folder]
-    while pending_folders:
-        folder_path = pending_folders.pop()
-        try:
-            with os.scandir(folder_path) as entries:
-                for entry in entries:
-                    target_paths = pending_folders if entry.is_dir(follow_symlinks=False) else files
-                    target_paths.append(Path(entry.path))
-        except OSError:
-            files.append(folder_path)
+    folders = os.walk(folder, onerror=lambda error: files.append(Path(error.filename)))
+    for parent, subfolder_names, file_names in folders:
+        paths = [Path(parent, name) for name in (*subfolder_names, *file_names)]
+        files += [path for path in paths if path.is_symlink() or not path.is_dir()]
     return sorted(files)
 
 

@@ -227,10 +227,13 @@ def convert_to_unit(text: str, unit: str) -> float | None:
     (0.1, 0.5, None)
     """
     match = _NUMBER_WITH_UNIT.fullmatch(text.strip())
+    if match is None:
+        return None
     unit = unit.lower()
-    unit_in_text = match[2].lower() or unit if match else ""
+    unit_in_text = match[2].lower() or unit
+    # Units without other units of the same quantity are not in the tables
     for factors in ({unit: 1.0}, *_UNIT_FACTORS.values()):
-        if match and {unit_in_text, unit} <= factors.keys():
+        if {unit_in_text, unit} <= factors.keys():
             with suppress(ValueError):  # float() rejects several decimal points
                 return float(match[1].replace(",", ".")) * (factors[unit_in_text] / factors[unit])
     return None

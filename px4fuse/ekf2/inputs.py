@@ -47,7 +47,7 @@ from px4fuse.flight.model import (
     Unavailable,
     sample_step_function,
 )
-from px4fuse.readers.common import find_flight_spans
+from px4fuse.readers.common import find_spans
 from px4fuse.readers.px4_innovations import has_fused_aid, replace_vision_by_gnss_innovations
 from px4fuse.readers.px4_positions import MAX_DOWNSAMPLED_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE_REMEDY
@@ -636,7 +636,7 @@ def _find_dead_reckoning_spans(ekf2: Ekf2, fusion_record: FusionRecord) -> Array
     vision_enabled_flag = ekf2.status_flags.get(EV_POS.name)
     if dead_reckoning_flag is None or vision_enabled_flag is None:
         return np.zeros((0, 2))
-    spans_s = np.array(find_flight_spans(dead_reckoning_flag == 0.0, np.inf)).reshape(-1, 2)
+    spans_s = np.array(find_spans(dead_reckoning_flag != 0.0, np.inf)).reshape(-1, 2)
     spans_s[:, 0] -= DEAD_RECKONING_TIMEOUT_S * (
         sample_step_function(vision_enabled_flag, spans_s[:, 0]) > 0.0
     )

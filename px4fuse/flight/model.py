@@ -460,7 +460,7 @@ class PositionTrack:
     def reset_times_s(self) -> Array:
         """Times (s) at which the reset counter of the source changes."""
         reset_counter = self.status.get("reset_counter", pd.Series(dtype=float))
-        return np.asarray(reset_counter.index[1:][np.diff(reset_counter) != 0.0], dtype=np.float64)
+        return np.asarray(reset_counter.index[1:][np.diff(reset_counter) != 0.0], np.float64)
 
 
 def estimate_white_noise_m(position_m: Array) -> float:
@@ -597,7 +597,7 @@ class AidLog:
 def sample_step_function(step_function: pd.Series[float], times: pd.Index[float] | Array) -> Array:
     """Return the values of a step function at the given times."""
     previous_rows = np.clip(np.searchsorted(step_function.index, times, side="right") - 1, 0, None)
-    return np.asarray(step_function, dtype=np.float64)[previous_rows]
+    return np.asarray(step_function, np.float64)[previous_rows]
 
 
 class ParameterChange(NamedTuple):

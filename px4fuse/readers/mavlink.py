@@ -125,8 +125,9 @@ def _read_imu(recording: Recording) -> TableOrUnavailable:
         layout = recording.find_most_frequent(IMU_LAYOUTS)
     rows = recording.rows(layout.topic)
     if layout == HIGHRES_IMU_LAYOUT:
-        imu_ids = np.array(recording.frames.table(layout.topic, rows)["id"])
-        rows = rows[np.isin(imu_ids, pd.Series(imu_ids).mode()[:1])]
+        imu_ids = recording.frames.table(layout.topic, rows)["id"]
+        most_frequent_id = np.bincount(imu_ids, minlength=1).argmax()
+        rows = rows[imu_ids == most_frequent_id]
     imu = recording.read(layout, rows)
     imu = common.select_valid_rows(imu, imu.columns.tolist(), common.MAX_IMU_READING)
     if len(imu) < 2:
@@ -223,10 +224,7 @@ def _compute_variance_from_accuracy(recording: Recording) -> pd.DataFrame:
     PX4's horizontal accuracy is √(σ_north² + σ_east²) (``get_ekf_lpos_accuracy``).
     """
     accuracy = recording.read(MESSAGE_LAYOUTS["ESTIMATOR_STATUS"])
-    horizontal_variance_m2 = accuracy["horizontal_m"] ** 2 / 2.0
-    variance = pd.concat(
-        [horizontal_variance_m2, horizontal_variance_m2, accuracy["vertical_m"] ** 2], axis=1
-    )
+    variance = accuracy[["horizontal_m", "horizontal_m", "vertical_m"]] ** 2 / [2.0, 2.0, 1.0]
     variance = variance[(variance > 0.0).all(axis=1)].set_axis(Columns.POSITION_VARIANCE, axis=1)
     return variance.reindex(columns=VARIANCE_COLUMNS)
 
@@ -243,8 +241,8 @@ def _read_airborne_spans(recording: Recording) -> Spans | Unavailable:
     recording.record_stream("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK_TEXT)
     rows = recording.rows("EXTENDED_SYS_STATE")[is_known]
     time_s = recording.compute_receipt_boot_times_s(rows) - recording.time_origin_s
-    is_landed = pd.Series(landed_states[is_known] == ON_GROUND_STATE, time_s)
-    return common.find_flight_spans(is_landed, recording.duration_s)
+    is_airborne = pd.Series(landed_states[is_known] != ON_GROUND_STATE, time_s)
+    return common.find_spans(is_airborne, recording.duration_s)
 
 
 def _read_parameters(recording: Recording) -> dict[str, float]:

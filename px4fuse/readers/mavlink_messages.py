@@ -46,8 +46,6 @@ class PositionMessageType:
     # Name of the position source for the option --position-source
     track_name: str
     description: str
-    # Name of the field definition in ``mavlink_messages.toml``; by default ``track_name``
-    layout_name: str = ""
     kind: str = "uwb"
     # Coordinate frame of the positions
     frame: str = "unknown"
@@ -60,7 +58,8 @@ class PositionMessageType:
 
     @property
     def layout(self) -> Layout:
-        return MESSAGE_LAYOUTS[self.layout_name or self.track_name]
+        """Fields of the message; those of ODOMETRY for its parts, such as ODOMETRY_VIO."""
+        return MESSAGE_LAYOUTS.get(self.track_name, MESSAGE_LAYOUTS["ODOMETRY"])
 
     @property
     def message(self) -> str:

@@ -51,8 +51,6 @@ from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 VISION_TOPIC = "vehicle_visual_odometry"
 # Fields of vehicle_local_position that are 1 while the horizontal position is valid
 VALIDITY_FLAGS = ("xy_valid", "xy_global")
-# Number of EKF2 states that are read; wind and terrain are not read
-STATE_COUNT = 22
 # Bit of filter_control_status_u (common.h) for fusion of the 3D magnetic field
 MAG_3D_FUSION_BIT = 5
 # Minimum rate (Hz) of a complete magnetometer log; EKF2 uses 14 Hz
@@ -182,7 +180,8 @@ def _find_state_vector(topics: Topics) -> tuple[str, int]:
 def _read_horizon_state(topics: Topics, step_s: float) -> TableOrUnavailable:
     """Read EKF2's state and variances at the fusion horizon.
 
-    Older PX4 releases log IMU biases per prediction. They are divided by the interval ``step_s``.
+    Older PX4 releases log variances of the quaternion, and IMU biases per prediction. The biases
+    are divided by the interval ``step_s``.
     """
     topic, attitude_variance_count = _find_state_vector(topics)
     if not topic:
@@ -193,23 +192,23 @@ def _read_horizon_state(topics: Topics, step_s: float) -> TableOrUnavailable:
             f"no supported PX4 release has states and covariances of these lengths in {topic}",
             "Report the PX4 version in an issue of px4fuse.",
         )
-    state_fields = [f"states[{i}]" for i in range(STATE_COUNT)]
-    variance_fields = [
-        f"covariances[{i}]" for i in range(STATE_COUNT - 4 + attitude_variance_count)
-    ]
-    layout = Layout(topic, {name: name for name in state_fields + variance_fields})
-    samples = topics.primary_samples(layout).dropna()
-    samples = samples[(samples[variance_fields] >= 0.0).all(axis=1)]
-    state = samples[state_fields].to_numpy(copy=True)
-    variance = samples[variance_fields].to_numpy(copy=True)
-    if attitude_variance_count == QUATERNION_VARIANCE_COUNT:
-        state[:, 10:16] /= step_s
-        variance = np.hstack(
-            [_convert_attitude_variance(state[:, :4], variance[:, :4]), variance[:, 4:]]
+    has_quaternion_variances = attitude_variance_count == QUATERNION_VARIANCE_COUNT
+    variance_columns = Columns.FUSION_HORIZON_VARIANCE
+    if has_quaternion_variances:
+        quaternion_variances = [f"{component}_variance" for component in Columns.QUATERNION]
+        variance_columns = quaternion_variances + Columns.FUSION_HORIZON_VARIANCE[3:]
+    fields = {name: f"states[{i}]" for i, name in enumerate(Columns.FUSION_HORIZON_STATE)}
+    fields |= {name: f"covariances[{i}]" for i, name in enumerate(variance_columns)}
+    samples = topics.primary_samples(Layout(topic, fields)).dropna()
+    samples = samples[(samples[variance_columns] >= 0.0).all(axis=1)].copy()
+    if has_quaternion_variances:
+        biases = Columns.GYRO_BIAS + Columns.ACCELEROMETER_BIAS
+        samples[biases] /= step_s
+        samples[[f"{bias}_squared" for bias in biases]] /= step_s**2
+        samples[Columns.FUSION_HORIZON_VARIANCE[:3]] = _convert_attitude_variance(
+            samples[Columns.QUATERNION].to_numpy(), samples[quaternion_variances].to_numpy()
         )
-        variance[:, 9:15] /= step_s**2
-    columns = Columns.FUSION_HORIZON_STATE + Columns.FUSION_HORIZON_VARIANCE
-    return pd.DataFrame(np.hstack([state, variance]), index=samples.index, columns=columns)
+    return samples[Columns.FUSION_HORIZON_STATE + Columns.FUSION_HORIZON_VARIANCE]
 
 
 def configured_step_s(topics: Topics) -> float:
@@ -243,7 +242,7 @@ def _estimate_step_s(topics: Topics) -> float:
 def find_rows_of_timestamps(times_s: Array, wanted_times_s: ArrayLike) -> IntArray:
     """Return the indices of ``times_s`` (increasing) that equal a wanted time, rounded to 1 µs."""
     times_us, wanted_times_us = (
-        np.rint(np.asarray(times, float) * 1e6) for times in (times_s, wanted_times_s)
+        np.rint(np.multiply(times, 1e6)) for times in (times_s, wanted_times_s)
     )
     rows = np.searchsorted(times_us, wanted_times_us)
     is_inside = rows < len(times_us)
@@ -268,7 +267,7 @@ def compute_samples_per_step(
     interval_ratio = configured_step_s / imu_interval_s
     # 1e-6 compensates rounding errors of the IMU interval
     sample_count = max(int(interval_ratio + 0.5 + 1e-6), 1)
-    samples_between_logged_ends = np.diff(np.asarray(step_ends))
+    samples_between_logged_ends = np.diff(step_ends)
     if (
         sample_count > 1
         and abs(interval_ratio + 0.5 - sample_count) < MAX_DISTANCE_FROM_HALF_INTEGER
@@ -436,19 +435,21 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     filtered_velocity = flow_velocity[["forward_m_s", "right_m_s"]]
     previous_part = filtered_velocity.shift().mul(previous_output_weight, axis=0)
     flow = (filtered_velocity - previous_part).div(1.0 - previous_output_weight, axis=0)
+    # The noise is logged in rad/s. The range to the ground, velocity ÷ flow rate of the newest
+    # sample, converts it to m/s
     newest_velocity = flow_velocity[["newest_forward_m_s", "newest_right_m_s"]]
-    squared_ground_distance_m2 = (newest_velocity**2).sum(axis=1) / (
-        flow_velocity[["x_rad_s", "y_rad_s"]] ** 2
-    ).sum(axis=1)
+    flow_rate = flow_velocity[["x_rad_s", "y_rad_s"]]
+    squared_range_m2 = (newest_velocity**2).sum(axis=1) / (flow_rate**2).sum(axis=1)
+    noise_rad2_s2 = np.interp(flow.index, flow_noise.index, flow_noise["noise"])
     flow = flow.assign(
         samples=sample_count,
         interval_s=interval_s,
-        noise_m2_s2=squared_ground_distance_m2
-        * np.interp(flow.index, flow_noise.index, flow_noise["noise"]),
+        noise_m2_s2=squared_range_m2 * noise_rad2_s2,
     )
     is_used = (steps_s > 0.5 * interval_s) & (steps_s <= MAX_FLOW_INTERVAL_S)
     if FLOW.name in enabled_aids:
         is_used &= sample_step_function(enabled_aids[FLOW.name], flow.index) > 0.0
+    # The range is infinite if the flow rate is zero
     return flow[is_used].replace(np.inf, np.nan).dropna()
 
 

@@ -132,19 +132,21 @@ def make_track(
     ----------
     samples : DataFrame
         Positions (m) and variances (m²). A variance of 0 means "not sent" (``EKF2.cpp``).
+    origin : SourceOrigin
+        Origin of the positions. The kind "uwb" means that the kind is inferred from the samples.
     needed_columns : list of str
-        Columns that must be finite.
+        Columns that must be finite: north and east, with or without down.
     is_odometry : bool
         True if the source also measures its orientation: it is then visual odometry, not UWB.
     track_fields
         Other fields of :class:`~px4fuse.flight.model.PositionTrack`.
     """
-    status_samples = samples[[name for name in POSITION_STATUS_COLUMNS if name in samples]]
+    status_samples = samples.filter(POSITION_STATUS_COLUMNS)
     samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
     quantisation_step_m = max(
-        estimate_quantisation_step(samples[name].to_numpy()) for name in needed_columns[:2]
+        estimate_quantisation_step(samples[name].to_numpy()) for name in Columns.POSITION[:2]
     )
-    is_number = samples[Columns.POSITION].notna().any()
+    is_measured = samples[Columns.POSITION].notna().any()
     if origin.is_gnss:  # a receiver at rest may repeat its position
         samples = select_valid_rows(samples, needed_columns)
     else:
@@ -153,13 +155,12 @@ def make_track(
         track_fields["invalid_reasons"] = invalid_reasons[invalid_reasons != ""]
     if len(samples) < MIN_TRACK_SAMPLES:
         fault = f"the track has only {len(samples)} finite samples, fewer than {MIN_TRACK_SAMPLES}"
-        if is_number.tolist() == [False, False, True]:
+        if is_measured["down_m"] and not is_measured[:"east_m"].any():
             fault = HEIGHT_ONLY_REASON
         return unavailable_source(name, fault, remedy)
     if origin.kind == "uwb":
-        origin = structs.replace(
-            origin, kind="vio" if is_odometry else infer_position_kind(samples)
-        )
+        kind = "vio" if is_odometry else infer_position_kind(samples)
+        origin = structs.replace(origin, kind=kind)
     variance = samples[Columns.POSITION_VARIANCE]
     return PositionTrack(
         name=name,
@@ -183,13 +184,45 @@ def _make_ulog_track(
     """Make a position track of a source that is defined in ``px4_topics.toml``."""
     source = TRACK_SOURCES[name]
     origin = structs.replace(source.origin, is_selectable_by_default=is_selectable_by_default)
+    default_fields: dict[str, Any] = {"frame": "NED", "clock": AUTOPILOT_CLOCK_TEXT}
     if origin.aid is not None:
-        parameters = topics.ekf2_parameters
-        lever_arm_m = tuple(parameters.get(parameter, 0.0) for parameter in origin.aid.lever_arm)
-        track_fields = {"lever_arm_m": lever_arm_m, **track_fields}
-    fields = {"frame": "NED", "clock": AUTOPILOT_CLOCK_TEXT, **track_fields}
-    fields |= {"description": source.description, "topics": topic_names, "log": topics.log.name}
-    return make_track(name, samples, origin, **fields)
+        default_fields["lever_arm_m"] = tuple(
+            topics.ekf2_parameters.get(parameter, 0.0) for parameter in origin.aid.lever_arm
+        )
+    return make_track(
+        name,
+        samples,
+        origin,
+        description=source.description,
+        topics=topic_names,
+        log=topics.log.name,
+        **default_fields | track_fields,
+    )
+
+
+def _describe_clock_without_measurement_times(topics: Topics, topic: str) -> ClockMap | None:
+    """Describe the timestamps of a topic if they are not measurement times; otherwise return None.
+
+    PX4 logs arrival times until it has received 500 TIMESYNC replies (``Timesync.cpp``).
+    """
+    table = topics.tables_of(topic)[0]
+    if "timestamp_sample" not in table or len(table["timestamp"]) < MIN_TRACK_SAMPLES:
+        return None
+    published_us = table["timestamp"].astype(np.int64)
+    sample_timestamps_us = table["timestamp_sample"].astype(np.int64)
+    age_us = published_us - sample_timestamps_us
+    if np.mean(np.abs(age_us) <= MAX_ARRIVAL_TO_PUBLICATION_DELAY_US) >= MIN_ARRIVAL_TIME_FRACTION:
+        clock_name = SENDER_CLOCK
+        note = "PX4 replaced timestamps by arrival times, because the clocks were not synchronised"
+    elif abs(np.median(age_us)) > MAX_PUBLICATION_LAG_S * 1e6:
+        clock_name = _describe_timestamp_clock(published_us, sample_timestamps_us)
+        note = "timestamp_sample is not boot time in µs, so px4fuse uses arrival times"
+    else:
+        return describe_repeated_timestamps(
+            SENDER_CLOCK, len(sample_timestamps_us), len(np.unique(sample_timestamps_us))
+        )
+    # Offset, drift and jitter are zero, because no clock is converted
+    return ClockMap(clock_name, "arrival time", len(age_us), 0.0, 0.0, 0.0, note)
 
 
 def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable:
@@ -218,65 +251,42 @@ def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable
         notes=(note,) if instance_count > 1 and not is_ekf2 else (),
         is_odometry=orientation is not None,
         frame=frame,
-        clock_map=_describe_clock_of_arrival_times(topics, layout.topic),
+        clock_map=_describe_clock_without_measurement_times(topics, layout.topic),
         orientation=orientation,
     )
 
 
-def _describe_clock_of_arrival_times(topics: Topics, topic: str) -> ClockMap | None:
-    """Describe the clock of a topic without measurement times; otherwise return None.
-
-    PX4 logs arrival times until it has received 500 TIMESYNC replies (``Timesync.cpp``).
-    """
-    table = topics.tables_of(topic)[0]
-    if "timestamp_sample" not in table or len(table["timestamp"]) < MIN_TRACK_SAMPLES:
-        return None
-    published_us = table["timestamp"].astype(np.int64)
-    sample_timestamps_us = table["timestamp_sample"].astype(np.int64)
-    age_us = published_us - sample_timestamps_us
-    if np.mean(np.abs(age_us) <= MAX_ARRIVAL_TO_PUBLICATION_DELAY_US) >= MIN_ARRIVAL_TIME_FRACTION:
-        clock_name = SENDER_CLOCK
-        note = "PX4 replaced timestamps by arrival times, because the clocks were not synchronised"
-    elif abs(np.median(age_us)) > MAX_PUBLICATION_LAG_S * 1e6:
-        clock_name = _describe_timestamp_clock(published_us, sample_timestamps_us)
-        note = "timestamp_sample is not boot time in µs, so px4fuse uses arrival times"
-    else:
-        return describe_repeated_timestamps(
-            SENDER_CLOCK, len(sample_timestamps_us), len(np.unique(sample_timestamps_us))
-        )
-    return ClockMap(clock_name, "arrival time", len(age_us), 0.0, 0.0, 0.0, note)
-
-
 def _describe_timestamp_clock(published_us: IntArray, sample_timestamps_us: IntArray) -> str:
-    """Return clock and unit of timestamps, for example "UNIX time in seconds"."""
+    """Return the clock or the unit of timestamps that are not boot times in µs.
+
+    The unit follows from the rate of the timestamps relative to the publication times.
+    """
     if not sample_timestamps_us.any():
         return "0"
     rate_ratio = np.ptp(published_us) / np.maximum(np.ptp(sample_timestamps_us), 1)
     for unit, unit_us in MICROSECONDS_BY_UNIT.items():
         if abs(rate_ratio / unit_us - 1.0) < MAX_CLOCK_RATE_ERROR_FRACTION:
-            if (
-                MIN_VALID_UNIX_TIME_S
-                <= np.median(sample_timestamps_us) * unit_us * 1e-6
-                < MAX_VALID_UNIX_TIME_S
-            ):
+            median_s = np.median(sample_timestamps_us) * unit_us * 1e-6
+            if MIN_VALID_UNIX_TIME_S <= median_s < MAX_VALID_UNIX_TIME_S:
                 return f"UNIX time in {unit}"
+            # The unit µs is correct, so the clock differs from the boot clock
             return "another clock" if unit == "microseconds" else unit
     return "an unknown clock"
 
 
 def _read_fused_observation(topics: Topics, is_odometry: bool) -> PositionTrack | Unavailable:
-    horizontal, vertical = (
-        TOPIC_LAYOUTS["estimator_aid_src_ev_pos"],
-        TOPIC_LAYOUTS["estimator_aid_src_ev_hgt"],
-    )
-    if topics.find_layout(horizontal) is None:
+    horizontal = TOPIC_LAYOUTS["estimator_aid_src_ev_pos"]
+    vertical = TOPIC_LAYOUTS["estimator_aid_src_ev_hgt"]
+    layouts = (horizontal, vertical)
+    topic_names = tuple(layout.topic for layout in layouts if topics.find_layout(layout))
+    if horizontal.topic not in topic_names:
         return unavailable_source(FUSED_OBSERVATION_TRACK_NAME)
     return _make_track_from_ekf2_topics(
         topics,
         FUSED_OBSERVATION_TRACK_NAME,
         topics.primary_samples(horizontal),
         topics.primary_samples(vertical),
-        (horizontal.topic, vertical.topic)[: 1 + (topics.find_layout(vertical) is not None)],
+        topic_names,
         # EKF2 subtracts half a prediction interval from times (estimator_interface.cpp)
         shift_s=0.5 * configured_step_s(topics),
         is_odometry=is_odometry,

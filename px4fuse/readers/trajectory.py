@@ -96,7 +96,9 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
     first_bytes = b"" if is_bag(path) else read_head(path, _COMMENT_SEARCH_BYTES, TrajectoryError)
     comment_text = "\n".join(re.findall(r"(?m)^\s*#.*", first_bytes.decode(errors="replace")))
     kind, kind_note = _detect_trajectory_kind(path, comment_text, position_m, rotation)
+    # A frame that the file format or the column names state is preferred to the detected frame
     frame, frame_note = _detect_frame(kind, position_m)
+    frame = _FRAME_BY_RECORDING_FRAMES.get(recording.frames, frame)
     time_s = samples.index.to_numpy()
     notes = (*recording.format_detection_notes, *recording.notes)
     return Trajectory(
@@ -105,7 +107,7 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
         time_s=time_s,
         position_m=position_m,
         rotation=rotation,
-        frame=_FRAME_BY_RECORDING_FRAMES.get(recording.frames, frame),
+        frame=frame,
         unix_offset_s=0.0 if recording.clock_kind == "UNIX" else None,
         sha256=recording.sha256,
         size_bytes=recording.size_bytes,

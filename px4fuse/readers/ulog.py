@@ -74,7 +74,8 @@ def read_ulog(name: str, content: bytes) -> Flight:
     barometer_delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
     is_in_flight = common.ends_in_flight(airborne_spans_s, topics.log.duration_s)
     dropped_counts = dict(sorted(topics.dropped.items()))
-    tilt_failure_flags = topics.read(TOPIC_LAYOUTS["failure_detector_status"])
+    # Flags of the failure detector for roll and pitch
+    has_excessive_tilt = topics.read(TOPIC_LAYOUTS["failure_detector_status"]).any(axis=1)
     return Flight(
         log=structs.replace(
             topics.log,
@@ -90,9 +91,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
         ekf2=ekf2,
         truth=truth,
         airborne=airborne_spans_s,
-        excessive_tilt_spans_s=common.find_flight_spans(
-            tilt_failure_flags.max(axis=1) == 0.0, topics.log.duration_s
-        ),
+        excessive_tilt_spans_s=common.find_spans(has_excessive_tilt, topics.log.duration_s),
         barometer=barometer(altitude_m, barometer_delay_s),
         missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *unavailable_positions),
         streams=topics.data_source_by_kind,
@@ -146,20 +145,22 @@ def _require_samples(
 
 
 def _read_imu(topics: Topics) -> pd.DataFrame:
+    """Read the valid IMU samples, with the measurement times of the accelerometer."""
     imu = topics.read(IMU_LAYOUT)
     # single arrays, because a copy of the whole table needs much memory
     columns = {name: values.to_numpy() for name, values in imu.items()}
-    time_s, rows = imu.index.to_numpy(), np.arange(len(imu))
-    if (offset_us := columns.pop("accelerometer_offset_us", None)) is not None:
-        rows = np.flatnonzero(offset_us != INVALID_ACCELEROMETER_OFFSET_US)
-        time_us = np.rint(time_s[rows] * 1e6 + offset_us[rows])
-        kept_rows = find_longest_increasing_subsequence(
-            time_us.astype(np.int64) + topics.time_origin_us
-        )
-        time_s, rows = time_us[kept_rows] * 1e-6, rows[kept_rows]
+    offset_us = columns.pop("accelerometer_offset_us", np.zeros(len(imu)))
+    is_valid = offset_us != INVALID_ACCELEROMETER_OFFSET_US
     for name in Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE:
-        is_valid = np.abs(columns[name][rows]) < common.MAX_IMU_READING
-        time_s, rows = time_s[is_valid], rows[is_valid]
+        is_valid &= np.abs(columns[name]) < common.MAX_IMU_READING
+    rows = np.flatnonzero(is_valid)
+    # Boot times, because find_longest_increasing_subsequence needs positive times
+    boot_time_us = np.rint(
+        imu.index.to_numpy()[rows] * 1e6 + offset_us[rows] + topics.time_origin_us
+    )
+    kept_rows = find_longest_increasing_subsequence(boot_time_us.astype(np.int64))
+    time_s = (boot_time_us[kept_rows] - topics.time_origin_us) * 1e-6
+    rows = rows[kept_rows]
     samples = np.empty((len(columns), len(rows)), np.float32)  # as in the log, to save memory
     for row, values in zip(samples, columns.values(), strict=True):
         row[:] = values[rows]
@@ -175,4 +176,4 @@ def _read_airborne_spans(topics: Topics) -> Spans | Unavailable:
             f"{DEFAULT_PROFILE_REMEDY} Or give the start and end of the flight (--start, --end).",
         )
     topics.record_stream("airborne", "vehicle_land_detected")
-    return common.find_flight_spans(land_detected["landed"], topics.log.duration_s)
+    return common.find_spans(land_detected["landed"] == 0.0, topics.log.duration_s)

@@ -199,18 +199,18 @@ class Topics:
     tables: Tables
     # Boot time (µs) at flight time zero
     time_origin_us: int
-    # Number of samples with an invalid timestamp, by topic
-    dropped: dict[str, int]
     # All EKF2 parameters at take-off
     ekf2_parameters: Mapping[str, float]
     # True if the file ends within a message
     is_truncated: bool
     # True if pyulog skipped invalid bytes or messages
     is_damaged: bool
+    # Changes of EKF2 parameters after take-off
+    parameter_changes: tuple[ParameterChange, ...]
     # Topics and clock of each kind of data, such as "imu"
     data_source_by_kind: dict[str, DataSource] = field(default_factory=dict)
-    # Changes of EKF2 parameters after take-off
-    parameter_changes: tuple[ParameterChange, ...] = ()
+    # Number of samples with an invalid timestamp, by topic
+    dropped: dict[str, int] = field(default_factory=dict)
 
     def instances(self, topic: str) -> list[int]:
         """Return the instance numbers of a topic, in ascending order."""
@@ -393,7 +393,7 @@ def read_topics(name: str, content: bytes) -> Topics:
         with contextlib.redirect_stdout(io.StringIO()):  # suppress the warnings that pyulog prints
             ulog = _TolerantULogParser(content_reader, message_name_filter_list=list_topics())
             tables = _read_tables(ulog)
-            # Without known topics, read all topics for the duration of the log
+            # Without known topics, read all topics, because the duration of the log is needed
             tables_for_time_span = tables or _read_tables(
                 _TolerantULogParser(_ULogContent(content))
             )
@@ -416,6 +416,9 @@ def read_topics(name: str, content: bytes) -> Topics:
     time_origin_us, data_end_us = _find_data_span_us(tables_for_time_span, name)
     logged_values, parameter_changes = _read_parameters(ulog, tables, time_origin_us)
     parameter_values, parameter_faults = replace_invalid_parameters(logged_values)
+    # pyulog has read the file up to its last header. The rest is an incomplete message
+    last_header_offset = content_reader.header_start_offset
+    is_truncated = last_header_offset < len(content) < content_reader.read_end_offset
     log = LogInfo(
         name=name,
         sha256=hashlib.sha256(content).hexdigest(),
@@ -441,7 +444,7 @@ def read_topics(name: str, content: bytes) -> Topics:
             if name in PARAMETERS
         },
         notes=(*notes, *parameter_faults),
-        bytes_read=content_reader.header_start_offset - content_reader.skipped_bytes,
+        bytes_read=last_header_offset - content_reader.skipped_bytes,
         autopilot=_read_printable_text(info, "sys_name", "PX4"),
         vehicle=_read_printable_text(info, "sys_uuid", ""),
         is_assessed=True
@@ -452,11 +455,10 @@ def read_topics(name: str, content: bytes) -> Topics:
         log,
         tables,
         time_origin_us,
-        {},
         {name: value for name, value in parameter_values.items() if name.startswith("EKF2_")},
-        content_reader.header_start_offset < len(content) < content_reader.read_end_offset,
+        is_truncated,
         ulog.file_corruption,
-        parameter_changes=parameter_changes,
+        parameter_changes,
     )
 
 
@@ -464,29 +466,25 @@ def _read_parameters(
     ulog: ULog, tables: Tables, time_origin_us: int
 ) -> tuple[dict[str, float], tuple[ParameterChange, ...]]:
     """Return the parameters at take-off, and later changes of EKF2 parameters."""
-    parameter_values = {
-        name: float(value)
-        for name, value in ulog.initial_parameters.items()
-        if isinstance(value, int | float)
-    }
     land_detector, take_off_time_us = tables.get(("vehicle_land_detected", 0), {}), 0
     landed = land_detector.get("landed")
     if landed is not None and not landed.all():
-        take_off_time_us = int(land_detector["timestamp"][np.argmin(landed)])
-    parameter_changes: list[ParameterChange] = []
-    last_parameter_values = parameter_values.copy()
-    for time_us, name, value in sorted(ulog.changed_parameters, key=lambda change: change[0]):
+        # Time of the first sample with landed = 0
+        take_off_time_us = int(land_detector["timestamp"][landed.argmin()])
+    values_at_take_off, last_values, changes = dict[str, float](), dict[str, float](), []
+    time_us_and_parameters = [(0, *parameter) for parameter in ulog.initial_parameters.items()]
+    time_us_and_parameters += sorted(ulog.changed_parameters, key=lambda change: change[0])
+    for time_us, name, value in time_us_and_parameters:
         if not isinstance(value, int | float):
             continue
-        if time_us <= take_off_time_us or name not in parameter_values:
-            parameter_values[name] = float(value)
-        elif name.startswith("EKF2_") and last_parameter_values[name] != value:
+        # The first logged value of a parameter is also its value at take-off
+        if time_us <= take_off_time_us or name not in last_values:
+            values_at_take_off[name] = float(value)
+        elif name.startswith("EKF2_") and value != last_values[name]:
             time_s = (time_us - time_origin_us) * _MICROSECOND_S
-            parameter_changes.append(
-                ParameterChange(time_s, name, last_parameter_values[name], float(value))
-            )
-        last_parameter_values[name] = float(value)
-    return parameter_values, tuple(parameter_changes)
+            changes.append(ParameterChange(time_s, name, last_values[name], float(value)))
+        last_values[name] = float(value)
+    return values_at_take_off, tuple(changes)
 
 
 def _read_tables(ulog: ULog) -> Tables:

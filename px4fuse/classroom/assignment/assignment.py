@@ -23,7 +23,7 @@ from px4fuse.classroom.assignment.random_assignment import (
     draw_uniform,
 )
 from px4fuse.classroom.assignment.roster import Person, normalise_text
-from px4fuse.core.input_files import suspend_input_registration
+from px4fuse.core.input_files import protect_inputs
 from px4fuse.core.text import to_json_types
 from px4fuse.core.writing import write_output_files
 from px4fuse.errors import OutputError
@@ -124,7 +124,7 @@ def write_assignment(
     OutputError
         A file exists with other content, or cannot be written.
     """
-    with suspend_input_registration():
+    with protect_inputs(is_active=False):
         key = read_answer_key(key_file) if key_file.exists() else AnswerKey(kind, ())
     answers = {normalise_text(answer.student_id): answer for answer in key.answers}
     # an answer key without these students belongs to another class

@@ -40,7 +40,7 @@ from px4fuse.classroom.grading.model import (
     list_item_titles,
 )
 from px4fuse.classroom.grading.oral_check import format_questions
-from px4fuse.core.input_files import suspend_input_registration
+from px4fuse.core.input_files import protect_inputs
 from px4fuse.core.text import clean_text, join_first_names, neutralise_formulas, one_line
 from px4fuse.core.writing import write_output_files
 from px4fuse.errors import SettingsError
@@ -192,7 +192,7 @@ def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade],
     """
     pseudonym_by_identity: dict[str, str] = {}
     if path.exists():
-        with suspend_input_registration():
+        with protect_inputs(is_active=False):
             sheet = read_sheet(path)
         for row in sheet.rows:
             pseudonym, identity, _ = (
