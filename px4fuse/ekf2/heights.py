@@ -344,7 +344,14 @@ class HeightFilter:
             GNSS_HGT, event, self.barometer_sample_count, x, P, gnss_variance_m2
         )
 
-    def update_bad_acceleration_flag(self, event: int, time_s: Array) -> None:
+    def update_bad_acceleration_flag(
+        self, event: int, time_s: Array, velocity_down_update: Array
+    ) -> None:
+        """Update the flag after the fusion of an event at ``time_s``.
+
+        ``velocity_down_update``, shape (2, filters), contains ν and S of the GNSS velocity.
+        """
+        self.update_records[event, -1, :2] = velocity_down_update
         update_records = self.update_records[max(event - 1, 0) : event + 1]
         innovations = -update_records[:, :, 0] / np.sqrt(update_records[:, :, 1])
         if (innovations > MIN_HEIGHT_INNOVATION_OF_ONE_SENSOR).any():

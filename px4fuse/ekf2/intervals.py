@@ -84,34 +84,29 @@ class EventIntervals:
     state_derivatives: Array
 
     def compute_transitions(self, rows: slice) -> tuple[Array, ...]:
-        """Return state transition and process noise of E intervals between fusions.
+        """Return transition and process noise of the motion state in E intervals between fusions.
+
+        The other states are constant.
 
         Returns
         -------
-        transition : ndarray, shape (E, 15, 15)
-        state_change_by_attitude_correction, state_change_by_acceleration : ndarray, shape (E, 15)
-            Change of the state in an interval by EKF2's attitude correction, and by acceleration.
+        transition : ndarray, shape (E, 9, 15)
+            Derivatives of the motion state with respect to all states except magnetic fields.
+        state_change_by_attitude_correction, state_change_by_acceleration : ndarray, shape (E, 9)
+            Change of the motion state in an interval by EKF2's attitude correction, and by
+            acceleration.
         gyro_noise_covariance, accelerometer_noise_covariance : ndarray, shape (E, 9, 9)
             Process noise per prediction step, for 1 rad/s (gyroscope) or 1 m/s² (accelerometer).
         """
         state_derivatives, duration_s = self.state_derivatives[rows], self.duration_s[rows]
-        transition = np.tile(np.eye(STATE_COUNT), (len(duration_s), 1, 1))
-        state_change_by_attitude_correction, state_change_by_acceleration = np.zeros(
-            (2, len(duration_s), STATE_COUNT)
-        )
-        transition[:, :MOTION_STATE_COUNT, THETA] = state_derivatives[..., :3]
-        transition[:, :MOTION_STATE_COUNT, BIASES] = state_derivatives[..., 3:9]
-        state_change_by_attitude_correction[:, :MOTION_STATE_COUNT] = state_derivatives[
-            ..., COLUMN_OF_DERIVATIVE_BY_ATTITUDE_CORRECTION
-        ]
-        state_change_by_acceleration[:, :MOTION_STATE_COUNT] = state_derivatives[
-            ..., COLUMN_OF_DERIVATIVE_BY_ACCELERATION
-        ]
+        transition = np.tile(np.eye(MOTION_STATE_COUNT, STATE_COUNT), (len(duration_s), 1, 1))
+        transition[:, :, THETA] = state_derivatives[..., :3]
+        transition[:, :, BIASES] = state_derivatives[..., 3:9]
         transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
         return (
             transition,
-            state_change_by_attitude_correction,
-            state_change_by_acceleration,
+            state_derivatives[..., COLUMN_OF_DERIVATIVE_BY_ATTITUDE_CORRECTION],
+            state_derivatives[..., COLUMN_OF_DERIVATIVE_BY_ACCELERATION],
             *_compute_imu_process_noise(
                 self.prediction_step_counts[rows], duration_s, transition[:, VELOCITY, THETA]
             ),

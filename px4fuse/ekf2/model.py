@@ -23,11 +23,11 @@ from px4fuse.core.arrays import (
     select_intervals,
 )
 from px4fuse.core.record import Span
+from px4fuse.ekf2.filter_batch import FilterConfiguration
 from px4fuse.ekf2.filter_recursion import (
     HEADING,
     HORIZONTAL_POSITION,
     HORIZONTAL_POSITION_COLUMNS,
-    FilterConfiguration,
     SegmentRun,
     estimate_state_correlation,
     run_segment,

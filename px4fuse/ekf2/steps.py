@@ -18,7 +18,7 @@ import pandas as pd
 
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import NOT_IN_JSON, Count, NotInJson, NotNegative, Record, Span
-from px4fuse.ekf2.filter_recursion import FilterConfiguration
+from px4fuse.ekf2.filter_batch import FilterConfiguration
 from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import (
     Ekf2Model,
