@@ -156,16 +156,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (the order of EKF2's fusions in one p
     ]
     height_filter = vision_filter = None
     if segment.height_samples is not None:
-        height_filter = HeightFilter(
-            segment,
-            batch.event_steps,
-            batch.events["time_s"],
-            positions.has_action,
-            batch.is_enabled_by_aid,
-            batch.parameters,
-            batch.has_gate,
-            bad_acceleration_flag,
-        )
+        height_filter = HeightFilter(batch, positions.has_action, bad_acceleration_flag)
     if inputs.vision_positions is not None:
         vision_filter = VisionFilter(batch)
     x, P = _make_start_state(batch, bad_acceleration_flag)
@@ -335,10 +326,9 @@ def _compute_bias_noise(batch: FilterBatch) -> ArrayPair:
         ("ACC_B", "ACC", ACCELEROMETER_BIAS, batch.estimates_biases),
     ]
     if batch.segment.magnetic_field is not None:
-        always = np.ones_like(batch.has_gate)
         sensors_and_states += [
-            ("MAG_E", "MAG", EARTH_MAGNETIC_FIELD, always),
-            ("MAG_B", "MAG", BODY_MAGNETIC_FIELD, always),
+            ("MAG_E", "MAG", EARTH_MAGNETIC_FIELD, True),
+            ("MAG_B", "MAG", BODY_MAGNETIC_FIELD, True),
         ]
     for bias_name, sensor_name, states, is_estimated in sensors_and_states:
         noise_density = is_estimated * batch.parameters[f"EKF2_{bias_name}_NOISE"]

@@ -282,10 +282,10 @@ def analyse_flight_loop(
                     "the analysed time span begins or ends in flight",
                     "Omit --start and --end, or give a loop closure with px4fuse loop --closure.",
                 )
-    odometry = find_odometry(flight)
     try:
         trajectory = trajectory_of(flight, "vio")
     except MissingDataError as error:  # missing odometry, or too few poses
+        odometry = find_odometry(flight)
         reason = odometry.reason if isinstance(odometry, Unavailable) else str(error).rstrip(".")
         return Unavailable(
             "loop closure",
@@ -295,10 +295,12 @@ def analyse_flight_loop(
     segment = loop_segment.choose_loop_segment(flight, trajectory, None, None)
     position_m = trajectory.cut_to_span(segment.start_s, segment.end_s).position_m
     extent_m = compute_extent_m(position_m)
-    end_to_start_distance_m = compute_extent_m(np.vstack([position_m[:1], position_m[-1:]]))
+    # A loop is at least as long as the way to its farthest point and back
+    min_path_length_m = 2.0 * extent_m
+    end_to_start_distance_m = float(np.linalg.norm(position_m[-1] - position_m[0]))
     if (
-        2.0 * extent_m < MIN_FLIGHT_LOOP_PATH_M
-        or end_to_start_distance_m > MAX_END_TO_START_DISTANCE_FRACTION * 2.0 * extent_m
+        min_path_length_m < MIN_FLIGHT_LOOP_PATH_M
+        or end_to_start_distance_m > MAX_END_TO_START_DISTANCE_FRACTION * min_path_length_m
     ):
         return Unavailable(
             "loop closure",

@@ -14,7 +14,6 @@ from px4fuse.loop.closure import (
     DOWN_DIRECTION,
     compute_heading_change_rad,
     correct_by_distance,
-    distribute_by_distance,
 )
 from px4fuse.loop.model import (
     LANDING_CLOSURE_SOURCE,
@@ -246,15 +245,16 @@ def distribute_closure_error_by_distance(
             )
     if isinstance(closure_error_vector_m, Unavailable):
         return {"by_distance_plain": closure_error_vector_m, "by_distance": closure_error_vector_m}
-    position_m = distribute_by_distance(path.position_m, closure_error_vector_m, distance_m)
-    heading_error_rad = (
-        0.0 if isinstance(heading_error_deg, Unavailable) else float(np.radians(heading_error_deg))
+    path_without_heading_correction = correct_by_distance(
+        path, distance_m, closure_error_vector_m, 0.0
     )
-    corrected_path = correct_by_distance(
-        path, distance_m, closure_error_vector_m, heading_error_rad
-    )
+    corrected_path = path_without_heading_correction
+    if not isinstance(heading_error_deg, Unavailable):
+        corrected_path = correct_by_distance(
+            path, distance_m, closure_error_vector_m, float(np.radians(heading_error_deg))
+        )
     return {
-        "by_distance_plain": (path.replace_positions(position_m), None),
+        "by_distance_plain": (path_without_heading_correction, None),
         "by_distance": (corrected_path, None),
     }
 
@@ -272,14 +272,18 @@ def _explain_gate_rejection(correction_name: str, closure: Closure) -> Unavailab
 def _gate_closures(
     graph: PoseGraph, closures: Sequence[GivenClosure], true_end: TrueFinalPose | Unavailable
 ) -> tuple[Closure, ...]:
-    """Test the loop closures against odometry with a χ² test."""
+    """Test the loop closures against odometry with a χ² test.
+
+    If ``true_end`` is known, the first closure is between take-off and landing.
+    """
     edge_count = len(graph.first_nodes)
     gate_results = gate_edges(graph, np.arange(edge_count - len(closures), edge_count))
     tested_closures: list[Closure] = []
     for closure, gate_result in zip(closures, gate_results, strict=True):
         error_m = graph.poses[gate_result.second, :3] - graph.poses[gate_result.first, :3]
         source = "given"
-        if not tested_closures and not isinstance(true_end, Unavailable):
+        is_first = not tested_closures
+        if is_first and not isinstance(true_end, Unavailable):
             error_m = error_m - true_end.displacement_vector_m
             source = LANDING_CLOSURE_SOURCE
         tested_closures.append(
@@ -350,16 +354,17 @@ def _correct_path(
 ) -> tuple[Trajectory, Solution]:
     """Correct each pose of a path by interpolation of the corrections of the graph nodes.
 
-    Return the corrected path, and ``solution`` unchanged.
+    Return the corrected path with its solution.
     """
     solved_poses = solution.poses
     node_corrections = (
         Rotation.from_quat(solved_poses[:, 3:]) * Rotation.from_quat(graph_poses[:, 3:]).inv()
     )
     time_s, node_time_s = path.time_s, path.time_s[node_indices]
-    # The first and the last pose of the path are nodes
+    # The first and the last pose of the path are nodes; the last pose is after the node before last
     previous_nodes = np.searchsorted(node_time_s[1:-1], time_s, side="right")
-    next_node_weight = np.interp(time_s, node_time_s, np.arange(len(node_time_s))) - previous_nodes
+    node_number = np.interp(time_s, node_time_s, np.arange(len(node_time_s)))
+    next_node_weight = node_number - previous_nodes
     position_corrected_by_previous_node_m, position_corrected_by_next_node_m = (
         solved_poses[node, :3]
         + node_corrections[node].apply(path.position_m - graph_poses[node, :3])
@@ -377,6 +382,8 @@ def score_paths(
     references: tuple[Trajectory, ...],
 ) -> dict[CorrectionName, PathResult | Unavailable]:
     """Compute ATE and RPE of the uncorrected path and of all corrected paths."""
+    # The time offset from the reference is estimated with the uncorrected path, which is scored
+    # first. All corrected paths have the same times, so they use the same offset
     time_offset_by_reference_s: dict[str, float] = {}
 
     def evaluate_path(path: Trajectory, reference: Trajectory) -> Evaluation | Unavailable:
