@@ -98,13 +98,13 @@ def deciding(
     velocity_gap_s: float = 0.0,
 ) -> tuple[bool, bool, bool, float, bool, int]:
     """Return rejected, fused and reset at 10 s; then last fusion, stopped, remaining resets."""
-    fusion = _FusionDecisions(
-        rules, 10.0 - gap_s, sample_actions=np.array([[action]]),
+    fusion = made(
+        _FusionDecisions, fusion_rules=rules, sample_actions=np.array([[action]]),
         can_start_fusion=np.array([[can_start_fusion]]),
         time_s=np.array([[10.0]]), has_gate=np.array([has_gate]),
         uses_logged_decisions=np.array([follows_log]),
         logged_rejected_flags=np.array([logged]), logged_resets=np.array([logged_reset]),
-        is_every_reset_logged=False,
+        is_every_reset_logged=False, last_position_s=np.array([10.0 - gap_s]),
     )  # fmt: skip
     fusion.last_velocity_s = np.array([10.0 - velocity_gap_s])
     fusion.is_stopped, fusion.remaining_resets = np.array([stopped]), np.array([left])

@@ -34,8 +34,6 @@ class FilterConfiguration:
         True if the accelerometer bias is a state.
     estimates_attitude : bool
         True if attitude and gyro bias are states.
-    fuses_velocity : bool
-        False to ignore the velocity of the position source.
     uses_reported_noise : bool
         False to ignore the variance that the position source reports.
     has_gate : bool
@@ -51,7 +49,6 @@ class FilterConfiguration:
     settings: dict[str, float]
     estimates_biases: bool = True
     estimates_attitude: bool = True
-    fuses_velocity: bool = True
     uses_reported_noise: bool = True
     has_gate: bool = True
     uses_logged_decisions: bool = False
@@ -73,18 +70,20 @@ class FilterConfiguration:
     def compute_delays(self, inputs: ReplayInputs) -> FusionDelays:
         """Return the delay of the position source, and the delay of the fusion horizon."""
         if self.timestamp_offset_s is not None:
+            # Without the half prediction step that EKF2 subtracts, and without late samples
             return FusionDelays(-self.timestamp_offset_s - 0.5 * inputs.mean_step_s, np.inf)
         delay_s = self.settings[inputs.aid.delay] * 1e-3
-        max_delay_ms = max(self.settings.get(aid.delay, 0.0) for aid in (GNSS_POS, EV_POS))
+        delays_ms = [self.settings.get(aid.delay, 0.0) for aid in (GNSS_POS, EV_POS)]
         min_horizon_s = inputs.horizon_s
         if not inputs.rules.is_horizon_set_by_largest_delay:
             # EKF2 raises EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp)
-            max_delay_ms = max(max_delay_ms, self.settings["EKF2_DELAY_MAX"])
-            if max_delay_ms == inputs.settings["EKF2_DELAY_MAX"]:
-                return FusionDelays(delay_s, inputs.horizon_s)
+            delays_ms.append(self.settings["EKF2_DELAY_MAX"])
             min_horizon_s = inputs.mean_step_s
+            # With the logged EKF2_DELAY_MAX, the logged delay of the fusion horizon applies
+            if max(delays_ms) == inputs.settings["EKF2_DELAY_MAX"]:
+                return FusionDelays(delay_s, inputs.horizon_s)
         # Number of samples in the IMU buffer (initialise_interface, estimator_interface.cpp)
-        buffer_length = math.ceil(max_delay_ms * 1e-3 / inputs.configured_step_s)
+        buffer_length = math.ceil(max(delays_ms) * 1e-3 / inputs.configured_step_s)
         return FusionDelays(delay_s, max((buffer_length - 1) * inputs.mean_step_s, min_horizon_s))
 
 
@@ -128,7 +127,6 @@ class FilterBatch:
             self.has_gate,
             self.uses_logged_decisions,
             self.uses_reported_noise,
-            self.fuses_velocity,
         ) = np.array(
             [
                 (
@@ -137,7 +135,6 @@ class FilterBatch:
                     configuration.has_gate,
                     configuration.uses_logged_decisions,
                     configuration.uses_reported_noise,
-                    configuration.fuses_velocity,
                 )
                 for configuration in configurations
             ]

@@ -25,7 +25,7 @@ from px4fuse.ekf2.heights import (
     BadAccelerationFlag,
     HeightFilter,
 )
-from px4fuse.ekf2.inputs import FusionRules, ReplayInputs
+from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.intervals import (
     FUSE,
     NO_ACTION,
@@ -354,34 +354,17 @@ class _PositionFusion:
 
     def __init__(self, batch: FilterBatch, bad_acceleration_flag: BadAccelerationFlag) -> None:
         inputs, parameters, events = batch.inputs, batch.parameters, batch.events
-        received_positions = inputs.received_positions
-        self.has_velocity = received_positions.velocity_m_s is not None
+        self.has_velocity = inputs.received_positions.velocity_m_s is not None
         self.batch, self.bad_acceleration_flag = batch, bad_acceleration_flag
         action = np.where(batch.has_gate, events["action"], FUSE * events["usable"])
         self.has_action = action > NO_ACTION
         self.has_sample = np.any(self.has_action, axis=1).tolist()
-        self.can_fuse_velocity = (
-            (action == FUSE) & batch.is_enabled_by_aid[GNSS_VEL.name] & batch.fuses_velocity
-        )
+        self.can_fuse_velocity = (action == FUSE) & batch.is_enabled_by_aid[GNSS_VEL.name]
         position_gate = parameters[inputs.aid.gate]
         gates = parameters.get(GNSS_VEL.gate, position_gate), position_gate
         self.gate_squared = np.maximum(np.repeat(gates, 3, axis=0).T, MIN_INNOVATION_GATE) ** 2
         self.measured_values, self.measurement_variance = _collect_measurements(batch)
-        is_aid_enabled = batch.is_enabled_by_aid[inputs.aid.name]
-        # All filters receive the same samples
-        samples = np.maximum(events["sample"][:, 0], 0)
-        self.decisions = _FusionDecisions(
-            inputs.rules,
-            batch.segment.time_s[0],
-            np.where(is_aid_enabled, action, NO_ACTION),
-            events["can_start_fusion"] & is_aid_enabled,
-            batch.event_time_s,
-            batch.has_gate,
-            batch.uses_logged_decisions,
-            received_positions.rejected_flags[samples],
-            received_positions.is_reset_to_sample[samples],
-            received_positions.is_every_reset_logged,
-        )
+        self.decisions = _FusionDecisions(batch, action)
         self.innovation, self.innovation_variance = np.full((2, *events.shape, 6), np.nan)
         self.rejected, self.fused, self.reset = np.zeros((3, *events.shape), bool)
         self.reset_m = np.zeros((*events.shape, 2))
@@ -545,28 +528,21 @@ def _update_sequentially(
     ``ekf_helper.cpp``), so the gain K = c/S is not optimal. With the column c = PH' of P and
     h = HPH', the Joseph form of an update is
 
-        P - cK' - Kc' + K (h + R) K' = P - b cc',  b = 2/S - (h + R)/S²
+        P - cK' - Kc' + K (h + R) K' = P - b cc',  b = (2 - (h + R)/S) / S
     """
     component_count = is_fused.shape[1]
     # Components that are not fused may be NaN: replace them by 1
     nu, S, R = np.where(is_fused, np.array([nu, S, R])[:, :, :component_count], 1.0)
     inverse_S = is_fused / S
-    b = 2.0 * inverse_S - inverse_S**2 * R
-    rows = slice(VELOCITY.start, VELOCITY.start + component_count)
-    # c of each component. Each update also changes c of the later components
-    columns = P[:, rows].copy()
-    for j in range(component_count):
-        column = columns[:, j : j + 1]
-        covariances = columns[:, j, rows]
-        b[:, j] -= inverse_S[:, j] ** 2 * covariances[:, j]
-        columns[:, j + 1 :] -= (b[:, j, None] * covariances[:, j + 1 :])[:, :, None] * column
-    x = x + ((inverse_S * nu)[:, None] @ columns)[:, 0]
-    # Sum of b cc' of all components
-    scaled_columns = np.sqrt(b)[:, :, None] * columns
-    return x, P - np.swapaxes(scaled_columns, 1, 2) @ scaled_columns
+    for column in range(component_count):
+        row = VELOCITY.start + column
+        c, gain = P[:, row], inverse_S[:, column]
+        b = gain * (2.0 - gain * (c[:, row] + R[:, column]))
+        x = x + c * (gain * nu[:, column])[:, None]
+        P = P - (b[:, None] * c)[:, :, None] * c[:, None]
+    return x, P
 
 
-@dataclass
 class _FusionDecisions:
     """Decisions on each position sample: reject it, fuse it, or reset the position to it.
 
@@ -574,33 +550,36 @@ class _FusionDecisions:
 
     Source: updateEvPosFusion, startEvPosFusion (``ev_pos_control.cpp``).
 
+    Parameters
+    ----------
+    action : ndarray of int, shape (events, filters)
+        Action of each filter on the sample if it is inside the gate.
+
     Attributes
     ----------
-    sample_actions, can_start_fusion, time_s : ndarray, shape (events, filters)
-        Action on each sample without rejections, see :mod:`~px4fuse.ekf2.intervals`.
-    has_gate, uses_logged_decisions : ndarray of bool, shape (filters,)
     logged_rejected_flags, logged_resets : ndarray, shape (events,)
         EKF2's logged decisions; NaN for an unknown rejection.
     last_position_s, last_velocity_s : ndarray, shape (filters,)
         Time of the last fusion or reset.
     """
 
-    fusion_rules: FusionRules
-    start_s: float
-    sample_actions: IntArray
-    can_start_fusion: BoolArray
-    time_s: Array
-    has_gate: BoolArray
-    uses_logged_decisions: BoolArray
-    logged_rejected_flags: Array
-    logged_resets: BoolArray
-    is_every_reset_logged: bool
-
-    def __post_init__(self) -> None:
-        configuration_count = len(self.has_gate)
-        self.last_position_s, self.last_velocity_s = np.full((2, configuration_count), self.start_s)
-        self.is_stopped = np.zeros(configuration_count, bool)
-        self.remaining_resets = np.full(configuration_count, self.fusion_rules.max_resets)
+    def __init__(self, batch: FilterBatch, action: IntArray) -> None:
+        received_positions, events = batch.inputs.received_positions, batch.events
+        is_aid_enabled = batch.is_enabled_by_aid[batch.inputs.aid.name]
+        self.fusion_rules, self.time_s = batch.inputs.rules, batch.event_time_s
+        self.sample_actions = np.where(is_aid_enabled, action, NO_ACTION)
+        self.can_start_fusion = events["can_start_fusion"] & is_aid_enabled
+        self.has_gate, self.uses_logged_decisions = batch.has_gate, batch.uses_logged_decisions
+        # All filters receive the same samples
+        samples = np.maximum(events["sample"][:, 0], 0)
+        self.logged_rejected_flags = received_positions.rejected_flags[samples]
+        self.logged_resets = received_positions.is_reset_to_sample[samples]
+        self.is_every_reset_logged = received_positions.is_every_reset_logged
+        self.last_position_s, self.last_velocity_s = np.full(
+            (2, events.shape[1]), batch.segment.time_s[0]
+        )
+        self.is_stopped = np.zeros(events.shape[1], bool)
+        self.remaining_resets = np.full(events.shape[1], self.fusion_rules.max_resets)
 
     def decide_fusion(
         self, event: int, is_outside_gate: BoolArray, is_velocity_fused: BoolArray

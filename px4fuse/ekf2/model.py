@@ -5,7 +5,7 @@ has 15 error states, or 21 with a magnetometer. Without a height sensor, the rep
 published height. Without a magnetometer, the replay uses EKF2's published heading.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -201,33 +201,10 @@ def replay_with_settings(
         Unknown parameter or aiding source, or a value outside PX4's range.
     """
     changes = [check_parameters(change) for change in settings]
-    inputs = model.inputs
-    reasons = {}
-    if inputs.rules.is_horizon_set_by_largest_delay:
-        reasons["EKF2_DELAY_MAX"] = (
-            f"{model.flight.log.firmware} has no EKF2_DELAY_MAX: the largest sensor delay "
-            "parameter sets the delay of the fusion horizon"
-        )
-    if inputs.received_positions.uses_sender_timestamps:
-        reasons[GNSS_POS.delay] = "EKF2 uses measurement times that the GNSS driver reports"
-    for name in (name for change in changes for name in change):
-        if name in reasons or name not in inputs.settings:
-            reason = reasons.get(name) or _describe_modelled_aids(inputs)
-            raise SettingsError(f"{name} has no effect in a replay of this log: {reason}.")
-    for name in disable_time_s_by_aid:
-        if name not in list_modelled_aids(inputs):
-            raise SettingsError(f"{name} cannot be omitted: {_describe_modelled_aids(inputs)}.")
+    _check_replayed_names(model, set().union(*changes), disable_time_s_by_aid)
     if excluded_times_s is not None:
-        received_positions = inputs.received_positions
-        is_excluded = _find_excluded_rows(received_positions.timestamp_s, excluded_times_s)
-        received_positions = replace(
-            received_positions,
-            rejected_flags=np.where(is_excluded, 1.0, np.nan),
-            is_reset_to_sample=np.zeros_like(is_excluded),
-            is_every_reset_logged=False,
-        )
-        inputs = replace(inputs, received_positions=received_positions)
-        model = replace(model, inputs=inputs, runs=())
+        model = _exclude_samples(model, excluded_times_s)
+    inputs = model.inputs
     configurations = [
         FilterConfiguration(
             {**inputs.settings, **change},
@@ -249,6 +226,46 @@ def replay_with_settings(
                 ~_find_excluded_rows(updates.index.to_numpy(), excluded_times_s - age_s)
             ]
         yield structs.replace(replay, updates=updates, agreement=model.agreement)
+
+
+def _check_replayed_names(
+    model: Ekf2Model, parameter_names: Iterable[str], aid_names: Iterable[str]
+) -> None:
+    """Raise SettingsError if a replay cannot use a parameter, or omit an aiding source."""
+    inputs = model.inputs
+    reasons = {}
+    if inputs.rules.is_horizon_set_by_largest_delay:
+        reasons["EKF2_DELAY_MAX"] = (
+            f"{model.flight.log.firmware} has no EKF2_DELAY_MAX: the largest sensor delay "
+            "parameter sets the delay of the fusion horizon"
+        )
+    if inputs.received_positions.uses_sender_timestamps:
+        reasons[GNSS_POS.delay] = "EKF2 uses measurement times that the GNSS driver reports"
+    for name in parameter_names:
+        if name in reasons or name not in inputs.settings:
+            reason = reasons.get(name) or _describe_modelled_aids(inputs)
+            raise SettingsError(f"{name} has no effect in a replay of this log: {reason}.")
+    for name in aid_names:
+        if name not in list_modelled_aids(inputs):
+            raise SettingsError(f"{name} cannot be omitted: {_describe_modelled_aids(inputs)}.")
+
+
+def _exclude_samples(model: Ekf2Model, excluded_times_s: Array) -> Ekf2Model:
+    """Return a model that rejects the position samples with these timestamps."""
+    received_positions = model.inputs.received_positions
+    is_excluded = _find_excluded_rows(received_positions.timestamp_s, excluded_times_s)
+    received_positions = replace(
+        received_positions,
+        rejected_flags=np.where(is_excluded, 1.0, np.nan),
+        is_reset_to_sample=np.zeros_like(is_excluded),
+        is_every_reset_logged=False,
+    )
+    return _replace_inputs(model, received_positions=received_positions)
+
+
+def _replace_inputs(model: Ekf2Model, **changes: Any) -> Ekf2Model:
+    """Return a model with other inputs, without the replays with the previous inputs."""
+    return replace(model, inputs=replace(model.inputs, **changes), runs=())
 
 
 def _find_excluded_rows(sample_times_s: Array, excluded_times_s: Array) -> BoolArray:
@@ -287,8 +304,7 @@ def add_position_noise(model: Ekf2Model, sigma_m: float, seed: int) -> Ekf2Model
         if samples := getattr(model.inputs, name):
             position_noise_m = rng.normal(scale=sigma_m, size=samples.position_m.shape)
             noisy_inputs[name] = replace(samples, position_m=samples.position_m + position_noise_m)
-    # The runs are without the added noise, so they are deleted
-    return replace(model, inputs=replace(model.inputs, **noisy_inputs), runs=())
+    return _replace_inputs(model, **noisy_inputs)
 
 
 def misalign_positions(model: Ekf2Model, rotation_deg: float, delay_s: float) -> Ekf2Model:
@@ -304,8 +320,7 @@ def misalign_positions(model: Ekf2Model, rotation_deg: float, delay_s: float) ->
         position_m=received_positions.position_m @ rotation_matrix,
         velocity_m_s=None if velocity_m_s is None else velocity_m_s @ rotation_matrix,
     )
-    inputs = replace(model.inputs, received_positions=received_positions)
-    return replace(model, inputs=inputs, runs=())
+    return _replace_inputs(model, received_positions=received_positions)
 
 
 def compute_delayed_tracks(
@@ -406,6 +421,7 @@ def _collect_updates_by_aid(
     inputs: ReplayInputs, run: SegmentRun, configuration_index: int
 ) -> dict[str, pd.DataFrame]:
     """Return the updates of one filter configuration, by PX4's name of the aiding source."""
+    # Columns of R, nu and S: velocity and position, see SegmentRun
     events, height_filter = run.events[configuration_index], run.height_filter
     end_s = run.segment.time_s[events.end_step]
     nu, S, R, rejected, fused, reset, posterior_variance = (

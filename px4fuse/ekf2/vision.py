@@ -53,12 +53,14 @@ def _group_vision_by_event(
         measurement_times_s,
         vision_positions.arrival_s - configuration.compute_delays(inputs).horizon_s,
     )
+    # EKF2 fuses a late sample when it arrives, after the earlier samples. 1e-9: rounding errors
     step_index = np.maximum.accumulate(np.searchsorted(time_s, earliest_fusion_times_s - 1e-9))
     is_usable = (
         (step_index > 0)
         & (step_index < len(time_s))
         & (earliest_fusion_times_s < measurement_times_s + MAX_DELAY_BEHIND_HORIZON_S)
     )
+    # NaN: vision is disabled
     is_usable &= np.isfinite(vision_positions.position_m[:, 0])
     # EKF2 fuses only the newer of two samples in one prediction step
     is_usable[:-1] &= step_index[1:] > step_index[:-1]
@@ -159,6 +161,7 @@ class VisionFilter:
             age_s, fusion_time_s, R_m2 = (
                 array[sample_index, event] for array in (self.age_s, self.fusion_time_s, self.R_m2)
             )
+            # 1. Innovation. The sample measured an earlier position: position - age_s · velocity
             HP = P[:, HORIZONTAL_POSITION] - age_s[:, None, None] * P[:, HORIZONTAL_VELOCITY]
             HPH = (
                 HP[:, :, HORIZONTAL_POSITION] - age_s[:, None, None] * HP[:, :, HORIZONTAL_VELOCITY]
@@ -179,6 +182,7 @@ class VisionFilter:
                 is_bias_updated[:, None],
             )
             S = predicted_variance + R
+            # 2. Decision: fuse, reject or restart
             has_fusion_restarted = (time_since_sample_s > MAX_SAMPLE_GAP_S) | (
                 is_gnss_off != self.was_gnss_off
             )
@@ -207,6 +211,7 @@ class VisionFilter:
             )
             is_evaluated = is_fused | is_outside_gate | is_position_reset
             self.update_records[event, sample_index] = np.where(is_evaluated, update_record, np.nan)
+            # 3. Update of the state, or reset of the position
             K = (np.linalg.inv(HPH + R[:, :, None] * np.eye(2)) @ HP).transpose(0, 2, 1)
             K *= is_fused[:, None, None]
             x = x + (K @ nu[:, :, None])[:, :, 0]
@@ -222,6 +227,7 @@ class VisionFilter:
                 np.where(is_gnss_off[:, None], R_m2, R),
             )
             self.position_reset_m[event] += position_reset_m
+            # 4. Bias, and times of the last sample, attempt and fusion
             # If the fusion of vision restarts during GNSS fusion, EKF2 sets the vision bias so that
             # vision agrees with EKF2's position
             is_bias_initialised = is_restarting & ~is_position_reset

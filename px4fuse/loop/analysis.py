@@ -89,17 +89,19 @@ def analyse(
     if truth and request.closed_loop and request.landed_at is None:
         final_pose_in_truth = loop_segment.find_final_pose_in_truth(path, truth, segment)
     true_end = _find_true_end(path, request, final_pose_in_truth, segment, is_assessed=is_assessed)
-    closures = []
-    if not isinstance(true_end, Unavailable):
-        closures.append(GivenClosure(segment.start_s, segment.end_s, true_end.sigma_m))
-    for given_closure in request.closures:
-        closure = GivenClosure(
-            convert_to_trajectory_time_s(given_closure.time_1_s),
-            convert_to_trajectory_time_s(given_closure.time_2_s),
-            given_closure.sigma_m,
+    closures = [
+        GivenClosure(
+            convert_to_trajectory_time_s(closure.time_1_s),
+            convert_to_trajectory_time_s(closure.time_2_s),
+            closure.sigma_m,
         )
+        for closure in request.closures
+    ]
+    for closure in closures:
         _require_valid_closure(closure, path)
-        closures.append(closure)
+    if not isinstance(true_end, Unavailable):
+        # The closure between take-off and landing is the first
+        closures.insert(0, GivenClosure(segment.start_s, segment.end_s, true_end.sigma_m))
     key_frame_spacing_m = request.key_frames_m
     if key_frame_spacing_m is None:
         key_frame_spacing_m = compute_default_spacing_m(path.position_m)

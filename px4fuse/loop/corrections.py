@@ -14,6 +14,7 @@ from px4fuse.loop.closure import (
     DOWN_DIRECTION,
     compute_heading_change_rad,
     correct_by_distance,
+    distribute_by_distance,
 )
 from px4fuse.loop.model import (
     LANDING_CLOSURE_SOURCE,
@@ -152,6 +153,7 @@ def build_pose_graph(
             key_frame_indices,
             "",
         )
+    # Nodes: key frames, and the poses at both ends of each closure
     closure_times_s = np.array(
         [(closure.time_1_s, closure.time_2_s) for closure in closures]
     ).reshape(-1, 2)
@@ -163,6 +165,7 @@ def build_pose_graph(
     translation_variance_m2, rotation_variance_rad2, variance_note = compute_odometry_variances(
         path, node_indices, noise
     )
+    # Edges: odometry between successive nodes, then closures
     step_indices = np.arange(len(node_indices) - 1)
     first_nodes = np.append(step_indices, closure_nodes[:, 0])
     second_nodes = np.append(step_indices + 1, closure_nodes[:, 1])
@@ -176,6 +179,7 @@ def build_pose_graph(
     measured_translation_m = first_rotation_inverse.apply(
         node_position_m[second_nodes] - node_position_m[first_nodes]
     )
+    # A closure states that both poses have the same position; orientations have no information
     landing_edge = len(step_indices)
     for edge_index, closure in enumerate(closures, start=landing_edge):
         measured_translation_m[edge_index] = 0.0
@@ -185,6 +189,7 @@ def build_pose_graph(
             true_end.displacement_vector_m
         )
         if true_end.heading_change_deg is not None:
+            # Rotate the final node about the vertical, so that the edge has the true heading change
             odometry_heading_change_rad = compute_heading_change_rad(
                 second_node_rotation[landing_edge] * node_rotation[first_nodes[landing_edge]].inv()
             )
@@ -195,6 +200,7 @@ def build_pose_graph(
                 Rotation.from_rotvec(heading_correction_rad * DOWN_DIRECTION)
                 * second_node_rotation[landing_edge]
             )
+            # Only the rotation about the vertical is known. Information is in axes of the final pose
             vertical_direction = second_node_rotation[landing_edge].inv().apply(DOWN_DIRECTION)
             heading_sigma_rad = np.radians(true_end.sigma_heading_deg or 0.0)
             information[landing_edge, 3:, 3:] = (
@@ -245,16 +251,15 @@ def distribute_closure_error_by_distance(
             )
     if isinstance(closure_error_vector_m, Unavailable):
         return {"by_distance_plain": closure_error_vector_m, "by_distance": closure_error_vector_m}
-    path_without_heading_correction = correct_by_distance(
-        path, distance_m, closure_error_vector_m, 0.0
+    position_m = distribute_by_distance(path.position_m, closure_error_vector_m, distance_m)
+    heading_error_rad = (
+        0.0 if isinstance(heading_error_deg, Unavailable) else float(np.radians(heading_error_deg))
     )
-    corrected_path = path_without_heading_correction
-    if not isinstance(heading_error_deg, Unavailable):
-        corrected_path = correct_by_distance(
-            path, distance_m, closure_error_vector_m, float(np.radians(heading_error_deg))
-        )
+    corrected_path = correct_by_distance(
+        path, distance_m, closure_error_vector_m, heading_error_rad
+    )
     return {
-        "by_distance_plain": (path_without_heading_correction, None),
+        "by_distance_plain": (path.replace_positions(position_m), None),
         "by_distance": (corrected_path, None),
     }
 
