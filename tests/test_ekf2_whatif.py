@@ -144,9 +144,7 @@ def test_steps_from_kf_to_ekf2_replace_one_property_each():
         segments=plain,
     )
     found = list(make_replacement_configurations(gnss, kf_settings).values())
-    assert ["gnss_vel" in configuration.disable_time_s_by_aid for configuration in found] == [
-        True
-    ] * 6 + [False] * 2
+    assert [configuration.fuses_velocity for configuration in found] == [False] * 6 + [True] * 2
     assert [configuration.has_gate for configuration in found] == [False] * 7 + [True]
     # the GNSS positions of KF already include the delay
     assert found[0].timestamp_offset_s == pytest.approx(-0.16)
@@ -171,9 +169,7 @@ def test_steps_from_kf_to_ekf2_replace_one_property_each():
     assert ["optical_flow" in each.disable_time_s_by_aid for each in configurations.values()] == [
         True
     ] * 8 + [False] * 2
-    assert ["gnss_vel" in each.disable_time_s_by_aid for each in configurations.values()] == [
-        True
-    ] * 7 + [False] * 3
+    assert [each.fuses_velocity for each in configurations.values()] == [False] * 7 + [True] * 3
 
 
 def test_longest_run_of_ekf2_rejections_has_start_and_duration():

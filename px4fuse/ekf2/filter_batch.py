@@ -34,6 +34,8 @@ class FilterConfiguration:
         True if the accelerometer bias is a state.
     estimates_attitude : bool
         True if attitude and gyro bias are states.
+    fuses_velocity : bool
+        False to ignore the velocity of the position source.
     uses_reported_noise : bool
         False to ignore the variance that the position source reports.
     has_gate : bool
@@ -49,6 +51,7 @@ class FilterConfiguration:
     settings: dict[str, float]
     estimates_biases: bool = True
     estimates_attitude: bool = True
+    fuses_velocity: bool = True
     uses_reported_noise: bool = True
     has_gate: bool = True
     uses_logged_decisions: bool = False
@@ -127,6 +130,7 @@ class FilterBatch:
             self.has_gate,
             self.uses_logged_decisions,
             self.uses_reported_noise,
+            self.fuses_velocity,
         ) = np.array(
             [
                 (
@@ -135,6 +139,7 @@ class FilterBatch:
                     configuration.has_gate,
                     configuration.uses_logged_decisions,
                     configuration.uses_reported_noise,
+                    configuration.fuses_velocity,
                 )
                 for configuration in configurations
             ]

@@ -359,7 +359,9 @@ class _PositionFusion:
         action = np.where(batch.has_gate, events["action"], FUSE * events["usable"])
         self.has_action = action > NO_ACTION
         self.has_sample = np.any(self.has_action, axis=1).tolist()
-        self.can_fuse_velocity = (action == FUSE) & batch.is_enabled_by_aid[GNSS_VEL.name]
+        self.can_fuse_velocity = (
+            (action == FUSE) & batch.is_enabled_by_aid[GNSS_VEL.name] & batch.fuses_velocity
+        )
         position_gate = parameters[inputs.aid.gate]
         gates = parameters.get(GNSS_VEL.gate, position_gate), position_gate
         self.gate_squared = np.maximum(np.repeat(gates, 3, axis=0).T, MIN_INNOVATION_GATE) ** 2
@@ -381,8 +383,11 @@ class _PositionFusion:
                 self.bad_acceleration_flag.until_s > batch.event_time_s[event]
             )
             is_clipped &= ~is_outside_gate[:, :VELOCITY_DOWN_COLUMN].any(axis=1)
-            limit = np.where(is_clipped[:, None], np.sqrt(self.gate_squared * S), np.inf)
-            nu[:, VELOCITY_DOWN_COLUMN] = np.clip(nu, -limit, limit)[:, VELOCITY_DOWN_COLUMN]
+            limit = np.sqrt(self.gate_squared * S)[:, VELOCITY_DOWN_COLUMN]
+            velocity_down_innovation = nu[:, VELOCITY_DOWN_COLUMN]
+            np.clip(
+                velocity_down_innovation, -limit, limit, velocity_down_innovation, where=is_clipped
+            )
             is_outside_gate[is_clipped, VELOCITY_DOWN_COLUMN] = False
         self.innovation[event], self.innovation_variance[event] = nu, S
         is_velocity_outside = is_outside_gate[:, VELOCITY_COLUMNS].any(axis=1)
@@ -418,17 +423,17 @@ class _PositionFusion:
         steps = batch.event_steps[event]
         is_heading_logged = segment.magnetic_field is None
         heading_error_rad = batch.estimates_attitude * segment.attitude_error_rad[steps, HEADING]
-        measurements = []
+        logged_states = []
         if is_heading_logged:
-            noise = _compute_noise_for_target_variance(
-                P, HEADING, segment.attitude_variance_rad2[steps, HEADING]
-            )
-            measurements.append((HEADING, heading_error_rad, noise))
+            logged_variance = segment.attitude_variance_rad2[steps, HEADING]
+            logged_states.append((HEADING, heading_error_rad, logged_variance))
         if segment.height_samples is None and not batch.inputs.fuses_vision_height:
-            noise = _compute_noise_for_target_variance(
-                P, POSITION_DOWN, segment.down_variance_m2[steps]
-            )
-            measurements.append((POSITION_DOWN, segment.down_m[steps], noise))
+            logged_variance = segment.down_variance_m2[steps]
+            logged_states.append((POSITION_DOWN, segment.down_m[steps], logged_variance))
+        measurements = [
+            (row, value, _compute_noise_for_target_variance(P, row, logged_variance))
+            for row, value, logged_variance in logged_states
+        ]
         if batch.inputs.aid != GNSS_POS and self.has_sample[event]:
             is_fused = self.fused[event]
             fused_states = [(POSITION_NORTH, is_fused), (POSITION_EAST, is_fused)]
@@ -436,14 +441,8 @@ class _PositionFusion:
                 fused_states.append((POSITION_DOWN, self.has_action[event]))
             for row, is_fused in fused_states:
                 column = row - VELOCITY_AND_POSITION.start
-                R = self.measurement_variance[event, :, column]
-                measurements.append(
-                    (
-                        row,
-                        self.measured_values[event, :, column],
-                        np.where(is_fused, R, np.inf),
-                    )
-                )
+                noise = np.where(is_fused, self.measurement_variance[event, :, column], np.inf)
+                measurements.append((row, self.measured_values[event, :, column], noise))
         x, P = _fuse_states(x, P, measurements)
         if is_heading_logged:
             x[:, HEADING] = heading_error_rad
@@ -662,20 +661,17 @@ def estimate_state_correlation(inputs: ReplayInputs, segment: ReplaySegment) -> 
 
     The log contains only the variances.
     """
-    initial_state_correlation = _compute_steady_state_correlation(segment)
-    if preceding_segment := segment.preceding_segment:
+    first_segment = segment.preceding_segment or segment
+    initial_state_correlation = _compute_steady_state_correlation(first_segment)
+    if first_segment is not segment:
         inputs = replace(inputs, vision_positions=None)
         configuration = FilterConfiguration(inputs.settings)
-        preceding_segment = replace(
-            preceding_segment,
-            initial_state_correlation=_compute_steady_state_correlation(preceding_segment),
-        )
+        first_segment = replace(first_segment, initial_state_correlation=initial_state_correlation)
         intervals = make_event_intervals(
-            inputs, preceding_segment, configuration.compute_delays(inputs)
+            inputs, first_segment, configuration.compute_delays(inputs)
         )
-        initial_state_correlation = _compute_correlation(
-            run_segment(inputs, preceding_segment, [configuration], [intervals]).covariance[0]
-        )
+        run = run_segment(inputs, first_segment, [configuration], [intervals])
+        initial_state_correlation = _compute_correlation(run.covariance[0])
     if segment.magnetic_field is not None:
         # EKF2 has just reset heading and magnetic fields, so they are uncorrelated
         initial_state_correlation = block_diag(

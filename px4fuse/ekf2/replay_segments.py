@@ -614,8 +614,8 @@ def _make_segment(
             fusion_record.delayed_state[Columns.FUSION_HORIZON_VARIANCE[:3]], step_times_s
         ).astype(np.float32),
         down_variance_m2=_interpolate(fusion_record.delayed_state[["down_m2"]], step_times_s)[:, 0],
-        attitude_error_rad=_interpolate(
-            pd.DataFrame(attitude_error_rad, state_times_s), step_times_s
+        attitude_error_rad=interpolate_columns(
+            step_times_s, state_times_s, attitude_error_rad
         ).astype(np.float32),
         initial_state_correlation=np.eye(15),
         is_acceleration_bad=(

@@ -61,12 +61,7 @@ VISION_PROPERTY = "external vision"
 REJECTION_PROPERTY = "rejections and resets"
 OUTPUT_PREDICTOR_PROPERTY = "output predictor"
 # Properties that add an aiding source, by PX4's name of the source
-PROPERTY_BY_ADDITIONAL_AID = {
-    MAG.name: MAGNETOMETER_PROPERTY,
-    GNSS_VEL.name: GNSS_VELOCITY_PROPERTY,
-    FLOW.name: FLOW_PROPERTY,
-    EV_POS.name: VISION_PROPERTY,
-}
+PROPERTY_BY_ADDITIONAL_AID = {FLOW.name: FLOW_PROPERTY, EV_POS.name: VISION_PROPERTY}
 
 
 class PropertyReplacement(Record, kw_only=True):
@@ -339,7 +334,8 @@ def make_replacement_configurations(
         estimates_attitude=False,
         uses_reported_noise=False,
         has_gate=False,
-        disable_time_s_by_aid=dict.fromkeys(additional_aids, 0.0),
+        fuses_velocity=False,
+        disable_time_s_by_aid=dict.fromkeys((MAG.name, *additional_aids), 0.0),
         timestamp_offset_s=kf_settings.clock_offset_s - applied_delay_s,
     )
     # Changed fields of the configuration, in the order of the replacements
@@ -356,6 +352,12 @@ def make_replacement_configurations(
         PROCESS_NOISE_PROPERTY: {"settings": logged_settings},
         ATTITUDE_PROPERTY: {"estimates_attitude": True},
     }
+    if MAG.name in replayed_aids:
+        replacements[MAGNETOMETER_PROPERTY] = {
+            "disable_time_s_by_aid": dict.fromkeys(additional_aids, 0.0)
+        }
+    if GNSS_VEL.name in replayed_aids:
+        replacements[GNSS_VELOCITY_PROPERTY] = {"fuses_velocity": True}
     for next_index, name in enumerate(property_by_aid.values(), start=1):
         replacements[name] = {
             "disable_time_s_by_aid": dict.fromkeys(additional_aids[next_index:], 0.0)

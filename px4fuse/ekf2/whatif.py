@@ -474,10 +474,11 @@ def _make_summary(
     """
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
+    # σ is compared at the times of the log, so replay and log have the same number of values
     logged_variance = ekf2.variance
     evaluated_times_s = rows_inside(ekf2.state, spans_s).index.to_numpy()
 
-    def error_m(direction: Array) -> float | Unavailable:
+    def compute_rmse_m(direction: Array) -> float | Unavailable:
         position_m = interpolate_component(
             published_track, Columns.POSITION, direction, evaluated_times_s
         )
@@ -497,7 +498,7 @@ def _make_summary(
         other_fields[axis] = AxisStatistics(
             *_compute_innovation_statistics(evaluated_updates, axis),
             median_sigma,
-            error_m(direction),
+            compute_rmse_m(direction),
         )
     aids = {
         name: _summarise_aid(evaluated, spans_s)
@@ -510,7 +511,7 @@ def _make_summary(
         other_fields["others"] = {EV_POS.name: vision}
     if other_aid_updates.keys() & HEIGHT_AID_NAMES:
         other_fields["heights"] = aids
-        other_fields["height_rmse_to_truth_m"] = error_m(np.eye(3)[2])
+        other_fields["height_rmse_to_truth_m"] = compute_rmse_m(np.eye(3)[2])
     return Ekf2Statistics(
         samples=len(evaluated_updates),
         rejected_fraction=float(evaluated_updates["rejected"].mean()),

@@ -80,6 +80,9 @@ def compute_odometry_variances(
         f"the odometry drift after 100 m is {noise.position_m:g} m in position and "
         f"{noise.heading_deg:g}° in heading (1 σ, {drift_origin_text})"
     ]
+    used_variance_text = (
+        "the {0} variance of odometry edges is the increase of the logged {0} variance"
+    )
     position_variance_increments_m2 = _compute_variance_increments(
         path.position_variance_m2, node_indices
     )
@@ -88,10 +91,7 @@ def compute_odometry_variances(
             position_variance_increments_m2.mean(axis=1),
             MIN_REPORTED_TO_DEFAULT_VARIANCE_RATIO * translation_variance_m2,
         )
-        variance_texts.append(
-            "the position variance of odometry edges is the increase of the logged position "
-            "variance"
-        )
+        variance_texts.append(used_variance_text.format("position"))
     elif path.position_variance_m2 is not None:
         variance_texts.append("the logged position variances do not grow, so they are not used")
     rotation_variance_increments_rad2 = _compute_variance_increments(
@@ -102,10 +102,7 @@ def compute_odometry_variances(
             rotation_variance_increments_rad2,
             MIN_REPORTED_TO_DEFAULT_VARIANCE_RATIO * rotation_variance_rad2,
         )
-        variance_texts.append(
-            "the orientation variance of odometry edges is the increase of the logged orientation "
-            "variance"
-        )
+        variance_texts.append(used_variance_text.format("orientation"))
     return translation_variance_m2, rotation_variance_rad2, "; ".join(variance_texts)
 
 
@@ -200,7 +197,7 @@ def build_pose_graph(
                 Rotation.from_rotvec(heading_correction_rad * DOWN_DIRECTION)
                 * second_node_rotation[landing_edge]
             )
-            # Only the rotation about the vertical is known. Information is in axes of the final pose
+            # Only the rotation about the vertical is known; its axis in the frame of the final pose
             vertical_direction = second_node_rotation[landing_edge].inv().apply(DOWN_DIRECTION)
             heading_sigma_rad = np.radians(true_end.sigma_heading_deg or 0.0)
             information[landing_edge, 3:, 3:] = (
