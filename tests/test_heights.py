@@ -17,7 +17,8 @@ from px4fuse.analysis import WhatIfAnalysis
 from px4fuse.ekf2.barometer import estimate_barometer_interval_s, find_fused_barometer_samples
 from px4fuse.ekf2.filter_batch import FilterBatch, FilterConfiguration
 from px4fuse.ekf2.filter_recursion import SegmentRun
-from px4fuse.ekf2.heights import BadAccelerationFlag, HeightFilter, add_heights
+from px4fuse.ekf2.height_samples import add_heights
+from px4fuse.ekf2.heights import BadAccelerationFlag, HeightFilter
 from px4fuse.ekf2.model import Ekf2Model, run_configurations
 from px4fuse.ekf2.replay_segments import HeightSamples, ReplaySegment
 from px4fuse.ekf2.whatif import HEIGHT_LOGGED_NOTE, what_if

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray, compute_median_interval_s
-from px4fuse.ekf2.heights import add_heights
+from px4fuse.ekf2.height_samples import add_heights
 from px4fuse.ekf2.replay_segments import (
     MIN_IMU_GAP_S,
     MIN_SEGMENT_DURATION_S,

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Count, NotNegative, Record, Share, one_line_repr
-from px4fuse.ekf2.heights import HEIGHT_SENSORS
+from px4fuse.ekf2.height_samples import HEIGHT_SENSORS
 from px4fuse.ekf2.inputs import find_horizontal_reset_times_s
 from px4fuse.ekf2.model import (
     Ekf2Model,
