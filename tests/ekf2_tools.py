@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from px4fuse.ekf2.filter_recursion import FilterConfiguration
+from px4fuse.ekf2.filter_batch import FilterConfiguration
 from px4fuse.ekf2.inputs import FusionRules, ReplayInputs
 from px4fuse.ekf2.intervals import EventIntervals, StepEvents, make_event_intervals
 from px4fuse.ekf2.model import Ekf2Model, prepare_ekf2_model

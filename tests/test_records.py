@@ -15,7 +15,7 @@ from px4fuse.results.contract import schema
 
 # Mutable buffers, which are filled while reading, writing or replaying
 BUFFERS = {
-    "ArrayEncoder", "Recording", "Topics", "_FusionDecisions",
+    "ArrayEncoder", "Recording", "Topics",
     "_PdfComparison", "_RunState",
 }  # fmt: skip
 

@@ -19,7 +19,8 @@ from exchange import replace
 
 from px4fuse.diagnose import diagnose_comparison, run_what_if
 from px4fuse.ekf2 import steps
-from px4fuse.ekf2.filter_recursion import FilterConfiguration, SegmentRun, run_segment
+from px4fuse.ekf2.filter_batch import FilterConfiguration
+from px4fuse.ekf2.filter_recursion import SegmentRun, run_segment
 from px4fuse.ekf2.inputs import ReceivedPositions, ReplayInputs
 from px4fuse.ekf2.intervals import StepEvents, make_event_intervals
 from px4fuse.ekf2.model import (

@@ -55,7 +55,7 @@ from px4fuse.comparison.rerun_effects import (
     find_partial_corrections,
 )
 from px4fuse.core.arrays import Array
-from px4fuse.ekf2.filter_recursion import FilterConfiguration
+from px4fuse.ekf2.filter_batch import FilterConfiguration
 from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import Ekf2Model, misalign_positions, replay_with_settings
 from px4fuse.ekf2.replay import HORIZONTAL_AXES, Ekf2Replay, rows_inside

@@ -155,9 +155,14 @@ def find_unmet_condition(positions: UnfusedPositions) -> UnmetCondition:
 def _check_enabling_parameter(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     parameter_name, bit = positions.aid.switch, 0
     if not positions.has_enabling_parameter:
-        parameter_name, bit = AID_MASK_PARAMETER, 3 if positions.is_vision else 0
-    parameter_value = int(positions.parameters.get(parameter_name, 1 << bit))
-    if parameter_value >> bit & 1:
+        # Before PX4 v1.14, one bit mask enables all sources: bit 0 GNSS, bit 3 vision
+        parameter_name = AID_MASK_PARAMETER
+        if positions.is_vision:
+            bit = 3
+    bit_value = 1 << bit
+    # Without the parameter in the log, the source is assumed to be enabled
+    parameter_value = int(positions.parameters.get(parameter_name, bit_value))
+    if parameter_value & bit_value:
         return
     fused_quantity_name = (
         "horizontal position"
@@ -167,7 +172,8 @@ def _check_enabling_parameter(positions: UnfusedPositions) -> Iterator[UnmetCond
     reason = (
         f"Fusion of {fused_quantity_name} is disabled: bit {bit} of {parameter_name} is not set."
     )
-    action = f"Set {parameter_name} to {parameter_value | 1 << bit}."
+    action = f"Set {parameter_name} to {parameter_value | bit_value}."
+    # Such a source cannot be fused as a position: the parameter is correct
     if is_height_only(positions.source):
         reason = f"The source contains no horizontal position: x and y are constant. {reason}"
         action = f"Leave bit {bit} of {parameter_name} unset."

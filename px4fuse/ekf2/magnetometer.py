@@ -43,6 +43,7 @@ def average_by_event(
     segment: ReplaySegment, sensor_samples: SensorSamples, event_end_steps: IntArray
 ) -> EventSamples:
     """Return the mean of the magnetometer or optical flow samples before each fusion."""
+    # The samples may be means of several EKF2 samples, whose numbers are added
     event_index = np.searchsorted(event_end_steps, sensor_samples.step_indices)
     # The last row contains the samples after the last event
     row_count = len(event_end_steps) + 1
@@ -103,7 +104,7 @@ def fuse_mean_sample(
     nu = mean_sample.value - predicted_value
     HP = H @ P
     S = HP @ H.transpose(0, 2, 1)
-    # innovation_variances is a view of S: adding R to it changes S
+    # innovation_variances is a view of the diagonal of S: adding R to it below changes S
     innovation_variances = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]
     has_sample = sample_count > 0.0
     update = np.empty((3, *nu.shape))
@@ -111,6 +112,7 @@ def fuse_mean_sample(
     is_fused = has_sample & (nu * nu <= gate[:, None] ** 2 * update[1]).all(axis=1)
     update[2] = is_fused[:, None]
     update[:, ~has_sample] = np.nan
+    # Noise of the mean of n samples: R / n. Without a sample, 1 avoids a singular S
     innovation_variances += np.where(has_sample, R / np.maximum(sample_count, 1.0), 1.0)[:, None]
     K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * is_fused[:, None, None]
     x = x + (K @ nu[:, :, None])[:, :, 0]

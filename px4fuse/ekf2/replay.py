@@ -234,20 +234,22 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavaila
             "Record vehicle_local_position during the whole flight.",
         )
     aid = find_replayed_position_source(ekf2)
-    agreement_by_axis, statistics = _compare_innovations(
+    comparison = _compare_innovations(
         replay,
         replay.updates,
         logged_innovations(ekf2),
         innovation_topic(aid) in ekf2.innovation_topics,
         state_difference,
     )
-    if not agreement_by_axis:
+    if isinstance(comparison, str):
         return Unavailable(
             ANALYSIS_NAME,
-            statistics["reason"],
+            comparison,
             "Record a longer flight with motion, with SDLOG_PROFILE bit 0 (default).",
         )
+    agreement_by_axis, statistics = comparison
     agreement_by_aid, omitted_aids = _compare_other_aids(ekf2, replay, state_difference)
+    # While EKF2 fuses only optical flow, position errors add up: the largest difference is compared
     flow_only_difference = _subtract_logged_state(
         replay, rows_inside(ekf2.state, replay.optical_flow_only_spans_s)
     )
@@ -280,11 +282,11 @@ def _compare_innovations(
     logged_innovations: pd.DataFrame,
     has_measurement_times: bool,
     state_difference: pd.DataFrame,
-) -> tuple[dict[str, AxisAgreement], dict[str, Any]]:
+) -> tuple[dict[str, AxisAgreement], dict[str, Any]] | str:
     """Compare replayed with logged innovations.
 
-    Return the agreement by axis (empty if the innovations cannot be compared), and fields of
-    :class:`Agreement` for all axes together.
+    Return the agreement by axis, and fields of :class:`Agreement` for all axes together; or the
+    reason why the innovations cannot be compared.
     """
     update_rows = match_updates(
         replayed_innovations,
@@ -301,14 +303,13 @@ def _compare_innovations(
     logged_innovations = logged_innovations[is_used]
     replayed_innovations = replayed_innovations.iloc[update_rows[is_used]]
     if len(logged_innovations) < MIN_COMPARED_INNOVATIONS:
-        reason = (
+        return (
             f"the log contains only {format_count(len(logged_innovations), 'innovation')} in the "
             f"replayed time (at least {MIN_COMPARED_INNOVATIONS} are needed)"
         )
-        return {}, {"good": False, "reason": reason}
     compared_innovations = (logged_innovations, replayed_innovations)
     if not all(np.ptp(innovations[columns], axis=0).all() for innovations in compared_innovations):
-        return {}, {"good": False, "reason": CONSTANT_INNOVATIONS_REASON}
+        return CONSTANT_INNOVATIONS_REASON
     is_rejected = np.array([innovations["rejected"] > 0.0 for innovations in compared_innovations])
     agreement_by_axis: dict[str, AxisAgreement] = {
         axis: _compare_axis(axis, *compared_innovations, state_difference) for axis in axes
@@ -368,19 +369,22 @@ def _compare_other_aids(
         # Without logged measurement times, innovations are matched by fusion time. The replay fuses
         # barometer samples later than EKF2, so the measurement time replaces their fusion time
         times_s = updates.index if name == BAROMETER.name else updates["fused_at_s"]
-        agreement_by_axis, statistics = _compare_innovations(
+        comparison = _compare_innovations(
             replay,
             updates.assign(fused_at_s=times_s),
             select_logged_aid_innovations(name, aid_log),
             innovation_topic(AIDS[name]) in aid_log.topics,
             state_difference,
         )
-        if agreement_by_axis:
-            agreement_by_aid[name] = agreement_by_axis
-        reason = statistics["reason"]
-        is_velocity = name == GNSS_VEL.name
-        if not statistics["good"] and (not is_velocity or reason == CONSTANT_INNOVATIONS_REASON):
-            omitted_aids[name] = reason
+        # GNSS velocity is omitted only if its innovations are constant, as those of a frozen sensor
+        may_disagree = name == GNSS_VEL.name
+        if isinstance(comparison, str):
+            if not may_disagree or comparison == CONSTANT_INNOVATIONS_REASON:
+                omitted_aids[name] = comparison
+            continue
+        agreement_by_aid[name], statistics = comparison
+        if not (statistics["good"] or may_disagree):
+            omitted_aids[name] = statistics["reason"]
     return agreement_by_aid, omitted_aids
 
 

@@ -12,13 +12,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import NOT_IN_JSON, Count, NotInJson, NotNegative, Record, Span
-from px4fuse.ekf2.filter_recursion import FilterConfiguration
+from px4fuse.ekf2.filter_batch import FilterConfiguration
 from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import (
     Ekf2Model,
@@ -201,6 +202,9 @@ def explain_difference_by_replacements(
         )
     state_span_s = float(state_times_s[0]), float(state_times_s[-1])
     property_names = (*configurations, OUTPUT_PREDICTOR_PROPERTY)
+    # Only the replays of the last two properties contain EKF2's rejections
+    *_, last_property_without_gate, _, _ = property_names
+    # Position and velocity of each track along each axis
     states_by_track = []
     # Tracks are computed one at a time, to limit the memory
     tracks = chain(
@@ -217,9 +221,7 @@ def explain_difference_by_replacements(
                 for run in kf_runs.values()
             ]
         )
-        # Last replay that fuses every sample; the replays of the last two properties contain EKF2's
-        # rejections
-        if property_name == property_names[-3]:
+        if property_name == last_property_without_gate:
             replay_track_without_gate = track
     spans = Segment(*state_span_s, "").cut(evaluated_spans)
     longest_rejection = _find_longest_rejection(
@@ -311,65 +313,63 @@ def make_replacement_configurations(
     configuration replaces one more property of KF by that of EKF2. The keys are the names of the
     replaced properties.
     """
-    logged_settings = inputs.settings
-    aid = inputs.aid
-    acceleration_noise_m_s2 = kf_settings.sigma_a_m_s2 * math.sqrt(
-        kf_settings.dt_s / inputs.mean_step_s
-    )
-    settings_with_kf_process_noise = {**logged_settings, "EKF2_ACC_NOISE": acceleration_noise_m_s2}
-    settings_with_kf_noises = {**settings_with_kf_process_noise, aid.noise: kf_settings.sigma_z_m}
+    logged_settings, aid = inputs.settings, inputs.aid
+    kf_process_noise = {
+        "EKF2_ACC_NOISE": kf_settings.sigma_a_m_s2
+        * math.sqrt(kf_settings.dt_s / inputs.mean_step_s)
+    }
+    kf_noises = {**kf_process_noise, aid.noise: kf_settings.sigma_z_m}
     # The delay is already subtracted from KF's GNSS times, but not from the replay's timestamps
     applied_delay_s = logged_settings[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
-    time_offset_s = kf_settings.clock_offset_s - applied_delay_s
-    settings_without_lever_arm = {**settings_with_kf_noises, **dict.fromkeys(aid.lever_arm, 0.0)}
     replayed_aids = list_modelled_aids(inputs)[1:]
     property_by_aid = {
-        aid: name for aid, name in PROPERTY_BY_ADDITIONAL_AID.items() if aid in replayed_aids
+        name: property_name
+        for name, property_name in PROPERTY_BY_ADDITIONAL_AID.items()
+        if name in replayed_aids
     }
     additional_aids = [*property_by_aid]
-    kf_configuration = FilterConfiguration(
-        settings_with_kf_noises,
+    configuration = FilterConfiguration(
+        {**logged_settings, **kf_noises, **dict.fromkeys(aid.lever_arm, 0.0)},
         estimates_biases=False,
         estimates_attitude=False,
         uses_reported_noise=False,
         has_gate=False,
         fuses_velocity=False,
         disable_time_s_by_aid=dict.fromkeys((MAG.name, *additional_aids), 0.0),
+        timestamp_offset_s=kf_settings.clock_offset_s - applied_delay_s,
     )
-    measurement_noise_configuration = replace(
-        kf_configuration, settings=settings_with_kf_process_noise, uses_reported_noise=True
-    )
-    process_noise_configuration = replace(
-        measurement_noise_configuration, settings=logged_settings, estimates_biases=True
-    )
-    configuration = replace(process_noise_configuration, estimates_attitude=True)
-    configurations = {
-        SAMPLE_TIMES_PROPERTY: replace(
-            kf_configuration, settings=settings_without_lever_arm, timestamp_offset_s=time_offset_s
-        ),
-        TIMESTAMPS_PROPERTY: kf_configuration,
-        MEASUREMENT_NOISE_PROPERTY: measurement_noise_configuration,
-        ACCELEROMETER_BIAS_PROPERTY: replace(
-            measurement_noise_configuration, estimates_biases=True
-        ),
-        PROCESS_NOISE_PROPERTY: process_noise_configuration,
-        ATTITUDE_PROPERTY: configuration,
+    # Changed fields of the configuration, in the order of the replacements
+    replacements: dict[str, dict[str, Any]] = {
+        TIMESTAMPS_PROPERTY: {
+            "settings": {**logged_settings, **kf_noises},
+            "timestamp_offset_s": None,
+        },
+        MEASUREMENT_NOISE_PROPERTY: {
+            "settings": {**logged_settings, **kf_process_noise},
+            "uses_reported_noise": True,
+        },
+        ACCELEROMETER_BIAS_PROPERTY: {"estimates_biases": True},
+        PROCESS_NOISE_PROPERTY: {"settings": logged_settings},
+        ATTITUDE_PROPERTY: {"estimates_attitude": True},
     }
     if MAG.name in replayed_aids:
-        configurations[MAGNETOMETER_PROPERTY] = configuration = replace(
-            configuration, disable_time_s_by_aid=dict.fromkeys(additional_aids, 0.0)
-        )
+        replacements[MAGNETOMETER_PROPERTY] = {
+            "disable_time_s_by_aid": dict.fromkeys(additional_aids, 0.0)
+        }
     if GNSS_VEL.name in replayed_aids:
-        configurations[GNSS_VELOCITY_PROPERTY] = configuration = replace(
-            configuration, fuses_velocity=True
-        )
+        replacements[GNSS_VELOCITY_PROPERTY] = {"fuses_velocity": True}
     for next_index, name in enumerate(property_by_aid.values(), start=1):
-        configurations[name] = configuration = replace(
-            configuration, disable_time_s_by_aid=dict.fromkeys(additional_aids[next_index:], 0.0)
-        )
-    return configurations | {
-        REJECTION_PROPERTY: FilterConfiguration(logged_settings, uses_logged_decisions=True)
-    }
+        replacements[name] = {
+            "disable_time_s_by_aid": dict.fromkeys(additional_aids[next_index:], 0.0)
+        }
+    configurations = {SAMPLE_TIMES_PROPERTY: configuration}
+    for name, changes in replacements.items():
+        configuration = replace(configuration, **changes)
+        configurations[name] = configuration
+    configurations[REJECTION_PROPERTY] = FilterConfiguration(
+        logged_settings, uses_logged_decisions=True
+    )
+    return configurations
 
 
 def _find_longest_rejection(
@@ -378,17 +378,23 @@ def _find_longest_rejection(
     span: Span,
     spans_s: Spans,
 ) -> RejectionRun | None:
+    """Return the longest series of rejected positions in the time ``span`` and in ``spans_s``.
+
+    The replays with and without rejections, ``baseline_replay`` and
+    ``fusion_horizon_track_without_gate``, give the effect of the series on the position.
+    """
     updates = rows_inside(baseline_replay.updates, spans_s)
     updates = updates[updates["fused_at_s"].between(*span)]
     is_rejected = updates["rejected"].to_numpy() > 0
     fusion_times_s = updates["fused_at_s"].to_numpy()
     if not is_rejected.any():
         return None
-    # A series of rejections ends at the next fused sample
+    # Rows of the first rejected sample, and of the next fused sample, of each series
     change_rows = np.flatnonzero(np.diff(is_rejected, prepend=False, append=False))
     run_starts, run_ends = change_rows.reshape(-1, 2).T
     longest_index = int(np.argmax(run_ends - run_starts))
     begin_s = fusion_times_s[run_starts[longest_index]]
+    # The last series may continue to the end of the flight
     end_s = fusion_times_s[min(run_ends[longest_index], len(fusion_times_s) - 1)]
     fusion_horizon_track = baseline_replay.delayed_state.loc[begin_s:end_s]
     position_difference = [

@@ -15,11 +15,11 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray, cumulative_sums
+from px4fuse.ekf2.filter_batch import FilterConfiguration
 from px4fuse.ekf2.filter_recursion import (
     HEADING,
     HORIZONTAL_POSITION,
     HORIZONTAL_POSITION_COLUMNS,
-    FilterConfiguration,
     SegmentRun,
 )
 from px4fuse.ekf2.inputs import GNSS_RULES, VISION_RULES, ReceivedPositions, ReplayInputs
