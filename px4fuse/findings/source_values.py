@@ -207,8 +207,8 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
         "source_lever_arm",
         f"{rotation_sentence}The {sensor_text} is mounted {np.hypot(forward_m, right_m):.2f} m "
         f"from the mounting point that EKF2 assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m "
-        f"right (± {1.96 * lever_arm.sigma_m:.2f} m, 95 %). When the vehicle turns, {error_text} changes "
-        f"by up to twice this distance. {effect_sentence}{NO_ESTIMATES_SENTENCE}",
+        f"right (± {1.96 * lever_arm.sigma_m:.2f} m, 95 %). When the vehicle turns, {error_text} "
+        f"changes by up to twice this distance. {effect_sentence}{NO_ESTIMATES_SENTENCE}",
         f"{action} Measure the position of the sensor relative to the IMU.",
         {"forward_m": forward_m, "right_m": right_m, "sigma_m": lever_arm.sigma_m},
     )
