@@ -320,20 +320,16 @@ def test_time_offset_sigma_equals_width_of_likelihood_parabola() -> None:
 
 
 @pytest.mark.parametrize("offset_s", [0.0, -0.2, -0.21, 0.333])
-def test_time_offset_maximises_likelihood_sum_of_flight_parts(monkeypatch, offset_s) -> None:
+def test_time_offset_maximises_likelihood_sum_of_flight_parts(offset_s) -> None:
     """Use parabolas as profiles of the parts."""
     shift, sigma = np.array([-0.05, 0.025, 0.0, 0.0]), np.array([0.03, 0.02, 0.03, 0.5])
 
-    def fit_constant_errors(grid: Array, *_: object) -> SimpleNamespace:
+    def fit_at_offsets(grid: Array, _: object) -> SimpleNamespace:
         square = (grid - offset_s - shift[:, None]) ** 2 / sigma[:, None] ** 2
         return SimpleNamespace(compute_segment_scores=lambda: 0.5 * square[None])
 
-    monkeypatch.setattr(time_offset, "fit_constant_errors", fit_constant_errors)
     moved = SimpleNamespace(
-        segment_edges=np.arange(5) * 2,
-        time_s=np.arange(8.0),
-        make_position_batches=lambda grid: grid,
-        measurement_weights=None,
+        segment_edges=np.arange(5) * 2, time_s=np.arange(8.0), fit_at_offsets=fit_at_offsets
     )
     parts, p = time_offset._estimate_flight_part_offsets(
         moved, offset_s, NoiseParameters(0.1, 0.1), 1.0, 0.0

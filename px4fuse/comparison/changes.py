@@ -70,7 +70,12 @@ def find_candidate_changes(
     summary: FilterSummary,
     statistic: Statistic,
 ) -> list[Change]:
-    """Return the changes of settings or data that may correct the mean NIS or NEES of a filter."""
+    """Return the changes of settings or data that may correct the mean NIS or NEES of a filter.
+
+    KF: noises, outliers, time offset, rotation and accelerometer bias. EKF2: noise, outliers,
+    delay, rotation and default parameters. Along the down axis: noise, outliers and delay only.
+    """
+    # A filter whose mean NIS is too small needs smaller noises, and outliers are not the cause
     is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
     axis_tuning = find_axis_tuning(estimates.tuning, axis)
     changes = list[Change]()
@@ -80,14 +85,16 @@ def find_candidate_changes(
     may_have_correlated_errors = (
         origin.may_drift or origin.is_gnss
     ) and not summary.is_underconfident_against_truth
-    if axis_tuning is not None and not (is_underconfident and may_have_correlated_errors):
-        changes += (
-            _find_kf_noise_changes(comparison.settings, axis_tuning, is_underconfident)
-            if ekf2_inputs is None
-            else _find_ekf2_noise_changes(ekf2_inputs, summary, axis_tuning)
-        )
-    if axis_tuning is not None and not is_underconfident and len(axis_tuning.outlier_time_s):
-        changes.append({OUTLIERS_KEY: float(len(axis_tuning.outlier_time_s))})
+    if axis_tuning is not None:
+        if not (is_underconfident and may_have_correlated_errors):
+            changes += (
+                _find_kf_noise_changes(comparison.settings, axis_tuning, is_underconfident)
+                if ekf2_inputs is None
+                else _find_ekf2_noise_changes(ekf2_inputs, summary, axis_tuning)
+            )
+        if not is_underconfident and len(axis_tuning.outlier_time_s):
+            changes.append({OUTLIERS_KEY: float(len(axis_tuning.outlier_time_s))})
+    # For EKF2, the delay parameter corrects the time offset, if PX4 permits the delay
     delay_change = ekf2_inputs and make_estimated_delay_change(
         comparison, ekf2_inputs, estimates.time_offset
     )
@@ -114,7 +121,11 @@ def find_main_axis_changes(
     axis: str,
     summary: FilterSummary,
 ) -> list[Change]:
-    """Return the changes of settings or data for re-runs along the axis of largest motion."""
+    """Return the changes of settings or data for re-runs along the axis of largest motion.
+
+    The report shows their effect also if the filter is consistent.
+    """
+    # Changes for the mean NIS are first
     changes = remove_repeated_changes(
         change
         for statistic in CONSISTENCY_STATISTICS[::-1]
@@ -123,9 +134,11 @@ def find_main_axis_changes(
         )
     )
     if ekf2_inputs is not None:
+        # Correct timestamps have another effect than the delay parameter, which has limits
         if any(ekf2_inputs.aid.delay in change for change in changes):
             changes += _find_offset_changes(estimates, ekf2_inputs)
         return remove_repeated_changes(changes)
+    # For KF, also test both noises together, and the default settings
     noise_changes = [change for change in changes if change.keys() <= KF_NOISE_SETTINGS]
     if len(noise_changes) > 1:
         changes.append({name: value for change in noise_changes for name, value in change.items()})
@@ -195,6 +208,8 @@ def _find_kf_noise_changes(
     changes = list[Change]()
     for name, noise in ((SIGMA_A, axis_tuning.sigma_a_two_state), (SIGMA_Z, axis_tuning.sigma_z)):
         setting = getattr(settings, name)
+        # A setting is too large above the 95 % interval, and too small below it. Without an
+        # estimate, a setting that is too large is reduced to the upper limit of the interval
         if is_underconfident:
             estimate = noise.value_or_bound(0.0)
             is_significant = noise.high is not None and setting > noise.high

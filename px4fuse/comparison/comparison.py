@@ -73,8 +73,16 @@ def _compare_axis(
     segment = prepared_comparison.segment
     # Only the axis of largest motion, which the report shows step by step, needs filterpy
     kf_run = run_kf(axis, prepared_comparison.settings, fast=not is_main)
-    ekf2_tracks, truth = tracks_and_truth = project_tracks(prepared_comparison, ekf2, axis, segment)
+    ekf2_tracks, truth = project_tracks(prepared_comparison, ekf2, axis, segment)
+    whole_flight_tracks = ekf2_tracks, truth
+    if segment.flight_span_s not in (None, (segment.start_s, segment.end_s)):
+        whole_flight_tracks = project_tracks(prepared_comparison, ekf2, axis, segment.whole_flight)
     tracks: dict[FilterName, FilterTracks] = {"kf": make_run_tracks(kf_run), "ekf2": ekf2_tracks}
+    filters = {}
+    for name, filter_tracks in tracks.items():
+        state, variance = find_compared_track(filter_tracks, ekf2_tracks.state)
+        errors = compute_error_statistics(state, variance, truth, filter_tracks.fusion_horizon)
+        filters[name] = _summarise_filter(filter_tracks, errors)
     updates = kf_run.updates
     north, east, down = axis.direction.tolist()
     rejected_flags = _drop_missing_values(ekf2_tracks.innovations, "rejected")
@@ -89,24 +97,14 @@ def _compare_axis(
             rate_hz=sample_rate(updates) if len(updates) > 1 else None,
             input_gap_s=kf_run.input_gap_s,
         ),
-        filters={
-            name: _summarise_filter(
-                each,
-                compute_error_statistics(
-                    *find_compared_track(each, ekf2_tracks.state), truth, each.fusion_horizon
-                ),
-            )
-            for name, each in tracks.items()
-        },
+        filters=filters,
         difference=compute_difference_statistics(kf_run, ekf2_tracks.state),
         rejected_fraction=float(rejected_flags.mean()) if len(rejected_flags) else None,
         axis=axis,
         kf_run=kf_run,
         tracks=tracks,
         truth=truth,
-        whole_flight_tracks=tracks_and_truth
-        if segment.flight_span_s in (None, (segment.start_s, segment.end_s))
-        else project_tracks(prepared_comparison, ekf2, axis, segment.whole_flight),
+        whole_flight_tracks=whole_flight_tracks,
     )
 
 

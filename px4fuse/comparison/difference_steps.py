@@ -315,13 +315,13 @@ def _describe_rmse(explanation: DifferenceExplanation) -> list[str]:
             f"{100 * MAX_RELATIVE_RMSE_DIFFERENCE:.0f} %): KF {kf_rmse_m:.3f} m, EKF2 "
             f"{ekf2_rmse_m:.3f} m."
         ]
+    # The properties are replaced one after the other: each replacement starts at the RMSE of the
+    # previous one. Find the largest change of the mean square in the direction from KF to EKF2
     rmses_m = [
         kf_rmse_m,
         *(replacement.position_rmse_to_truth_m or 0.0 for replacement in explanation.steps),
     ]
-    mean_square_changes = np.diff(np.square(rmses_m))
-    if ekf2_rmse_m < kf_rmse_m:
-        mean_square_changes *= -1.0
+    mean_square_changes = np.diff(np.square(rmses_m)) * np.sign(ekf2_rmse_m - kf_rmse_m)
     index = int(np.argmax(mean_square_changes))
     return [
         f"Position RMSE: EKF2 {ekf2_rmse_m:.3f} m, KF {kf_rmse_m:.3f} m. KF's RMSE changes "

@@ -243,7 +243,10 @@ def _fit_source_errors(
     SourceLowPass | Unavailable,
     TimeCorrelatedNoise | Unavailable,
 ]:
-    """Fit biases, scale factor and jumps, then the time correlation of the remaining errors."""
+    """Fit biases, scale factor and jumps, then the time correlation of the remaining errors.
+
+    Each fit uses the results of the fit before.
+    """
     axes_and_tuning = _select_horizontal_axes(comparison, tuning)
     if isinstance(axes_and_tuning, Unavailable):
         return axes_and_tuning, axes_and_tuning, axes_and_tuning
@@ -285,6 +288,7 @@ def _fit_source_errors(
     )
     if isinstance(time_correlation_fit, Unavailable):
         return systematic_errors, time_correlation_fit, time_correlation_fit
+    # With ground truth, time-correlated noise is fitted to the errors of the positions
     source_low_pass, correlated_noise = time_correlation_fit
     truths = [comparison.axes[axis.name].truth for axis in axes]
     available_truths = [truth for truth in truths if not isinstance(truth, Unavailable)]
@@ -355,6 +359,7 @@ def widen_for_scatter(time_offset: SourceTimeOffset, cause: str) -> SourceTimeOf
     """
     offsets_s = np.array([part.offset_s for part in time_offset.parts])
     weights = np.array([part.sigma_s**-2.0 for part in time_offset.parts])
+    # Too few parts to estimate the scatter. Drift and change cannot be distinguished from scatter
     if len(offsets_s) <= MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE:
         return structs.replace(
             time_offset, change_p_value=None, drift_ppm=None, drift_sigma_ppm=None

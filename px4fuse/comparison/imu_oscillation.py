@@ -59,12 +59,14 @@ def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | Non
     rotation_to_vehicle_axes = np.exp(
         -1j * np.interp(time_s[1:-1], attitude.index.to_numpy(), headings_rad)
     )
+    # A second difference ÷ interval² is an acceleration
     window = np.hanning(len(rotation_to_vehicle_axes))
     second_differences_m = np.diff(positions_m, 2, axis=1) * rotation_to_vehicle_axes * window
     spectra = np.fft.fft([*second_differences_m, np.diff(second_differences_m, axis=0)[0]])
     count = len(rotation_to_vehicle_axes) // 2
     # The signals are complex: an oscillation along one axis has equal powers at positive and at
     # negative frequency. Add both
+    # Rows: source, IMU, and their difference. [:, -1] is the negative frequency of [:, 1]
     powers = np.abs(spectra[:, 1:count]) ** 2 + np.abs(spectra[:, :-count:-1]) ** 2
     source_power, imu_power, error_power = (np.convolve(row, np.ones(3), "same") for row in powers)
     frequencies_hz = np.arange(1, count) / (len(rotation_to_vehicle_axes) * interval_s)
@@ -76,6 +78,7 @@ def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | Non
         (error_power[1:-1] > error_power[:-2]) & (error_power[1:-1] > error_power[2:])
     )
     peaks = peaks[(peaks >= first) & (peaks < end)]
+    # Rows from frequency ÷ ratio to frequency · ratio, for each peak
     band_rows = np.searchsorted(
         frequencies_hz,
         np.outer([1.0 / BAND_LIMIT_RATIO, BAND_LIMIT_RATIO], frequencies_hz[peaks]),
@@ -89,6 +92,8 @@ def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | Non
     # The Hann window spreads an oscillation over 3 bins with 1.5 times the power of the middle bin.
     # Both signs of the frequency together: imu_power is 3 times the power of the middle bin
     amplitude_m = 2.0 * np.sqrt(imu_power[peak] / 3.0) / window.sum()
+    # Derivative ÷ difference of a sinusoid of this frequency; its square is the ratio for second
+    # differences
     acceleration_per_difference = np.pi * frequency_hz / np.sin(np.pi * frequency_hz * interval_s)
     oscillation = ImuOscillation(frequency_hz, float(amplitude_m * acceleration_per_difference**2))
     is_oscillating = (

@@ -55,9 +55,7 @@ def remove_origin_resets(
         reset for reset in ekf2.resets if segment.start_s < reset.time_s <= segment.end_s
     ]
     state = ekf2.state.copy() if resets_in_segment else ekf2.state
-    removed = "removed from EKF2's track: the resets only move the origin of EKF2's frame"
-    kept = "kept: the resets correct an error of EKF2"
-    texts_by_reset_treatment: dict[str, list[str]] = {removed: [], kept: []}
+    removed_texts, kept_texts = list[str](), list[str]()
     for label, quantity, columns in (
         ("horizontal position", "position", Columns.POSITION[:2]),
         ("height", "position", Columns.POSITION[2:]),
@@ -72,7 +70,7 @@ def remove_origin_resets(
         ]
         if not resets:
             continue
-        reset_treatment = kept
+        texts = kept_texts
         if quantity == "position":  # a velocity does not depend on the origin
             samples = cut_to_segment(track.samples, segment)[columns].dropna()
             compute_squared_distance_m2 = partial(_compute_squared_distance_m2, samples)
@@ -81,11 +79,17 @@ def remove_origin_resets(
             if compute_squared_distance_m2(
                 closest_state
             ) < MAX_DISTANCE_RATIO_WITHOUT_RESETS * compute_squared_distance_m2(ekf2.state):
-                state[columns], reset_treatment = closest_state, removed
-        texts_by_reset_treatment[reset_treatment].append(f"{len(resets)} of {label}")
+                state[columns], texts = closest_state, removed_texts
+        texts.append(f"{len(resets)} of {label}")
     statements = (
-        f"Jumps by EKF2 resets ({', '.join(texts)}) are {reset_treatment}"
-        for reset_treatment, texts in texts_by_reset_treatment.items()
+        f"Jumps by EKF2 resets ({', '.join(texts)}) are {treatment}"
+        for texts, treatment in (
+            (
+                removed_texts,
+                "removed from EKF2's track: the resets only move the origin of EKF2's frame",
+            ),
+            (kept_texts, "kept: the resets correct an error of EKF2"),
+        )
         if texts
     )
     return state, ". ".join(statements)

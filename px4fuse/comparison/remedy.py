@@ -75,8 +75,10 @@ def estimate_gnss_delay_ms(
             for axis in ("north", "east")
             for updates in update_tables
         ]
-        # Scale the mean to the same number of samples in all replays
+        # NIS sum over velocity and position: the mean, times the equal number of samples in all
+        # replays
         nis_sums.append(float(np.mean(nis)) * len(nis) * len(received_positions.timestamp_s))
+    # NIS sum = -2 ln p = (delay - estimate)² / σ² + constant
     quadratic_coefficient, linear_coefficient, _ = np.polyfit(GNSS_DELAYS_MS, nis_sums, 2)
     if quadratic_coefficient <= 0.0:
         return None
@@ -110,6 +112,7 @@ def estimate_ekf2_parameters(
     if not is_source_fused(comparison, inputs):
         return {}
     axis_tuning = find_first_available_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
+    # With GNSS, a noise of vision below that of GNSS has no effect
     used_noise_m = find_used_noise_m(inputs)
     min_noise_m = used_noise_m if origin.may_drift or origin.is_gnss else 0.0
     if (

@@ -166,6 +166,8 @@ def find_cause_rerun(
             rerun.corrects_sensor
             and explained_fraction_error <= ONLY_CAUSE_EXPLAINED_FRACTION_TOLERANCE
         )
+        # The smallest tuple is the best: first sufficient re-runs, then few changes, then corrected
+        # sensor faults, then the smallest remaining inconsistency
         return (
             not (is_complete or brings_inside_limits(rerun, statistic)),
             len(rerun.change.keys() - CHANGE_KEYS_WITHOUT_EFFECT_ALONE),

@@ -209,10 +209,8 @@ def _find_changes_to_test(
 
     ``ekf2_inputs`` is None for KF.
     """
-    axis, summary = (
-        axis_result.axis.name,
-        axis_result.filters["kf" if ekf2_inputs is None else "ekf2"],
-    )
+    axis = axis_result.axis.name
+    summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
     if not isinstance(summary, FilterSummary) or (ekf2_inputs is not None and axis == "down"):
         return []  # EKF2's replay contains no vertical position
     statistics: list[Statistic] = ["nees"] if find_error_above_sigma(summary) else []
@@ -224,8 +222,9 @@ def _find_changes_to_test(
         )
         for statistic in statistics
     }
-    changes = remove_repeated_changes(chain.from_iterable(candidates.values()))
-    if axis_result is comparison.main:
+    if axis_result is not comparison.main:
+        changes = remove_repeated_changes(chain.from_iterable(candidates.values()))
+    else:
         changes = find_main_axis_changes(comparison, estimates, ekf2_inputs, axis, summary)
     return [
         (change, tuple(statistic for statistic in statistics if change in candidates[statistic]))
@@ -264,6 +263,7 @@ def _rerun_with_changes(
         )
 
     reruns = [make_rerun(change, discrepancies) for change, discrepancies in changes]
+    # If no change alone is sufficient, combine the best change with each other helpful change
     for statistic in CONSISTENCY_STATISTICS:
         helpful_reruns = find_partial_corrections(reruns, statistic)
         reruns += [
@@ -284,7 +284,7 @@ def _find_statistics_without_change(
     """
     replayed, ekf2 = tested_filter.rerun(axis_result, {}), axis_result.ekf2_tracks
     evaluated_spans_s, innovations = tested_filter.evaluated_spans_s, ekf2.innovations
-    if evaluated_spans_s is None:
+    if evaluated_spans_s is None:  # KF
         return replayed, True
     if isinstance(ekf2.state, Unavailable) or isinstance(innovations, Unavailable):
         return replayed, False
@@ -298,6 +298,7 @@ def _find_statistics_without_change(
         compute_difference_statistics(axis_result.kf_run, logged_state),
         float((rejected_flags > 0.0).mean()) if len(rejected_flags) else None,
     )
+    # A statistic that is not logged is not compared
     is_replay_similar = all(
         logged_value and replayed_value and 1.0 / limit <= logged_value / replayed_value <= limit
         for logged_value, replayed_value, limit in (
@@ -340,6 +341,7 @@ def _rerun_kf(
         name: change[name] for name in change if name in vars(Settings())
     }
     changed_settings = replace(comparison.settings, **kf_settings)
+    # Apply the corrections of the data in sequence: rotation, bias, outliers, time offset
     rotates_gnss_positions = ROTATION_KEY in change and comparison.source.origin.is_gnss
     if ROTATION_KEY in change:
         rotated_direction = _rotate_direction(axis.direction, change[ROTATION_KEY])
@@ -393,6 +395,8 @@ def _replay_ekf2(
     model_with_moved_positions = misalign_positions(
         model, change.get(ROTATION_KEY, 0.0), change.get(TIME_OFFSET_KEY, 0.0)
     )
+    # Convert the outlier times from KF's timestamps to those of the replay: without KF's time
+    # offset, with the tested time offset, and for GNSS with the delay that KF subtracts
     excluded_times_s, axis_tuning = None, find_axis_tuning(tuning, HORIZONTAL)
     if OUTLIERS_KEY in change and axis_tuning is not None:
         excluded_times_s = axis_tuning.outlier_time_s - comparison.settings.clock_offset_s
@@ -428,6 +432,7 @@ def _summarise_replay(
         )
         for name in ("innovation_variance", "observation_variance", "position_variance")
     )
+    # P⁻ = S - R
     prior_variance_m2 = innovation_variance_m2 - observation_variance_m2
     variance_by_time = pd.DataFrame(
         {

@@ -19,6 +19,7 @@ from px4fuse.filter.imu_motion import (
     MAX_IMU_INTERVAL_S,
     MIN_SEGMENT_MEASUREMENTS,
     MotionCache,
+    PositionsAndImuMotion,
     compute_imu_motion,
 )
 from px4fuse.filter.settings import Settings
@@ -298,38 +299,12 @@ def _estimate_heading_error_from_positions(
                 f"{MIN_HEADING_FIT_DURATION_S:g} s",
                 "Analyse a longer segment.",
             )
-        positions_and_increments = motion.make_positions_at_offset(0.0)
-        # Effect of a heading error: motion along the smooth path through the positions (last row),
-        # rotated by 90°. With the noisy motion from the IMU, the estimate would be too small
-        for increments in (
-            positions_and_increments.delta_position_m,
-            positions_and_increments.delta_velocity_m_s,
-        ):
-            north_m, east_m = increments[:, :, -1]
-            increments[:, :, 1 + HEADING_ERROR_INDEX] = -east_m, north_m
-        noise_parameters = maximise_likelihood(
-            [positions_and_increments],
-            noise_parameters,
-            motion.measurement_weights,
-            fits_outliers=False,
-        ).noise_parameters
-        position_fit = fit_constant_errors(
-            [positions_and_increments], noise_parameters, motion.measurement_weights
+        noise_parameters, error_rad, heading_variance_rad2 = _fit_heading_errors(
+            motion, noise_parameters
         )
-        constant_errors = position_fit.estimate_constant_errors_by_segment()[is_part_long_enough, 0]
-        constant_errors_covariance = np.linalg.inv(
-            position_fit.compute_constant_error_information()
-        )[is_part_long_enough, 0]
-        # The smooth path has the scale of the measured positions, but a heading error rotates true
-        # distances: divide the fitted heading error by the ratio of true to measured distances
-        true_to_measured_scale = np.maximum(
-            1.0 - constant_errors[:, -1], MIN_TRUE_TO_MEASURED_SCALE
-        )
-        error_rad = constant_errors[:, HEADING_ERROR_INDEX] / true_to_measured_scale
-        heading_variance_rad2 = (
-            constant_errors_covariance[:, HEADING_ERROR_INDEX, HEADING_ERROR_INDEX]
-            / true_to_measured_scale**2
-        )
+        error_rad = error_rad[is_part_long_enough]
+        heading_variance_rad2 = heading_variance_rad2[is_part_long_enough]
+        # The fit is linear in the heading error, so it is repeated with rotated positions
         correction_rad, weight_sum = np.average(
             error_rad, weights=1.0 / heading_variance_rad2, returned=True
         )
@@ -345,6 +320,7 @@ def _estimate_heading_error_from_positions(
         heading_drift_variance_rad2 + heading_variance_rad2
     )
     misalignment_rad = float(np.angle(np.exp(1j * misalignment_rad)))
+    # Rows: start, end, heading error, σ
     heading_part_fields = np.column_stack(
         [
             spans_s[is_part_long_enough],
@@ -358,4 +334,38 @@ def _estimate_heading_error_from_positions(
         tuple(HeadingPart(*row) for row in heading_part_fields.tolist()),
         float(chdtrc(len(heading_variance_rad2) - 1, chi_square)) if is_drift_tested else 1.0,
         "positions",
+    )
+
+
+def _fit_heading_errors(
+    motion: PositionsAndImuMotion, noise_parameters: NoiseParameters
+) -> tuple[NoiseParameters, Array, Array]:
+    """Fit the noises; return them, and heading error (rad) and variance (rad²) of each segment."""
+    positions_and_increments = motion.make_positions_at_offset(0.0)
+    # Effect of a heading error: motion along the smooth path through the positions (last row),
+    # rotated by 90°. With the noisy motion from the IMU, the estimate would be too small
+    for increments in (
+        positions_and_increments.delta_position_m,
+        positions_and_increments.delta_velocity_m_s,
+    ):
+        north_m, east_m = increments[:, :, -1]
+        increments[:, :, 1 + HEADING_ERROR_INDEX] = -east_m, north_m
+    noise_parameters = maximise_likelihood(
+        [positions_and_increments],
+        noise_parameters,
+        motion.measurement_weights,
+        fits_outliers=False,
+    ).noise_parameters
+    position_fit = fit_constant_errors(
+        [positions_and_increments], noise_parameters, motion.measurement_weights
+    )
+    constant_errors = position_fit.estimate_constant_errors_by_segment()[:, 0]
+    covariance = np.linalg.inv(position_fit.compute_constant_error_information())[:, 0]
+    # The smooth path has the scale of the measured positions, but a heading error rotates true
+    # distances: divide the fitted heading error by the ratio of true to measured distances
+    true_to_measured_scale = np.maximum(1.0 - constant_errors[:, -1], MIN_TRUE_TO_MEASURED_SCALE)
+    return (
+        noise_parameters,
+        constant_errors[:, HEADING_ERROR_INDEX] / true_to_measured_scale,
+        covariance[:, HEADING_ERROR_INDEX, HEADING_ERROR_INDEX] / true_to_measured_scale**2,
     )

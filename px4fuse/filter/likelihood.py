@@ -13,7 +13,7 @@ from scipy.linalg import lapack
 from scipy.optimize import brentq, minimize_scalar
 from scipy.special import chdtri
 
-from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray
 from px4fuse.filter.model import (
     INITIAL_COVARIANCE,
     SymmetricElements,
@@ -72,21 +72,21 @@ def preintegrate(axis: Axis, settings: Settings) -> PreintegratedMotion:
         ``settings.input`` is "imu" and the axis has no acceleration.
     """
     prediction_steps = make_prediction_steps(axis, settings)
-    last_steps, interval_index, time_from_step_to_interval_end_s = _assign_steps_to_intervals(
-        prediction_steps
-    )
-    step_times_s = prediction_steps.time_s
+    last_steps, step_times_s = prediction_steps.last_steps, prediction_steps.time_s
+    # Covariance at the end of the interval due to the acceleration noise in one step
     process_noise_per_sigma_a_squared = settings.dt_s * np.stack(
         propagate_covariance(
             compute_process_noise_per_density(np.diff(step_times_s)),
-            time_from_step_to_interval_end_s,
+            prediction_steps.compute_time_to_interval_end_s(),
         ),
         1,
     )
     dp, dv = integrate_acceleration(prediction_steps, prediction_steps.acceleration_m_s2)
 
     def sum_by_interval(values: Array) -> Array:
-        return np.stack([np.bincount(interval_index, column) for column in values.T], 1)
+        return np.stack(
+            [np.bincount(prediction_steps.interval_index, column) for column in values.T], 1
+        )
 
     return PreintegratedMotion(
         interval_s=np.diff(step_times_s[np.append(0, last_steps)]),
@@ -108,39 +108,16 @@ def integrate_acceleration(
 
     ``acceleration_m_s2`` contains the acceleration in each prediction step.
     """
-    _, interval_index, time_from_step_to_interval_end_s = _assign_steps_to_intervals(
-        prediction_steps
+    step_s = np.diff(prediction_steps.time_s)
+    zeros = np.zeros(len(step_s))
+    # The velocity change of a step moves the vehicle until the end of the interval
+    dp, dv = propagate_state(zeros, zeros, acceleration_m_s2, step_s)
+    dp, dv = propagate_state(dp, dv, zeros, prediction_steps.compute_time_to_interval_end_s())
+    dp, dv = (
+        np.bincount(prediction_steps.interval_index, increment).astype(float)
+        for increment in (dp, dv)
     )
-    zeros = np.zeros(len(time_from_step_to_interval_end_s))
-    dp, dv = propagate_state(
-        *propagate_state(zeros, zeros, acceleration_m_s2, np.diff(prediction_steps.time_s)),
-        zeros,
-        time_from_step_to_interval_end_s,
-    )
-    dp, dv = (np.bincount(interval_index, increment).astype(float) for increment in (dp, dv))
     return dp, dv
-
-
-def _assign_steps_to_intervals(
-    prediction_steps: PredictionSteps,
-) -> tuple[IntArray, IntArray, Array]:
-    """Assign each prediction step to an interval between measurements.
-
-    Returns
-    -------
-    last_steps : ndarray
-        Index of the last step of each interval.
-    interval_index : ndarray
-        Index of the interval that contains each step.
-    time_from_step_to_interval_end_s : ndarray
-        Time from the end of each step to the end of its interval.
-    """
-    last_steps = np.flatnonzero(prediction_steps.measurement_index >= 0)
-    interval_index = np.searchsorted(last_steps, np.arange(1, len(prediction_steps.time_s)))
-    time_from_step_to_interval_end_s = (
-        prediction_steps.time_s[last_steps[interval_index]] - prediction_steps.time_s[1:]
-    )
-    return last_steps, interval_index, time_from_step_to_interval_end_s
 
 
 def innovations(
@@ -176,14 +153,14 @@ def compute_gains(
         sigma_a_m_s2 * sigma_a_m_s2 * preintegrated_motion.process_noise_per_sigma_a_squared
         + preintegrated_motion.process_noise_independent_of_sigma_a
     )
+    if is_skipped is None:
+        is_skipped = np.zeros(len(process_noise), bool)
     covariance: SymmetricElements[float] = INITIAL_COVARIANCE
     variance_and_gains_by_measurement = []
     for dt, (q00, q01, q11), skips_update in zip(
         preintegrated_motion.interval_s.tolist(),
         process_noise.tolist(),
-        [False] * len(preintegrated_motion.interval_s)
-        if is_skipped is None
-        else is_skipped.tolist(),
+        is_skipped.tolist(),
         strict=True,
     ):
         p00, p01, p11 = propagate_covariance(covariance, dt)  # P = FPFᵀ + Q
@@ -191,8 +168,11 @@ def compute_gains(
         (_, s, k0, k1), (_, _, updated_covariance) = update_step(
             0.0, 0.0, covariance, 0.0, sigma_z_m * sigma_z_m
         )
-        variance_and_gains_by_measurement.append((s, 0.0, 0.0) if skips_update else (s, k0, k1))
-        covariance = covariance if skips_update else updated_covariance
+        if skips_update:
+            k0 = k1 = 0.0
+        else:
+            covariance = updated_covariance
+        variance_and_gains_by_measurement.append((s, k0, k1))
     return np.array(variance_and_gains_by_measurement).T
 
 
@@ -200,7 +180,9 @@ def compute_innovations_with_gains(
     preintegrated_motion: PreintegratedMotion, k0: Array, k1: Array
 ) -> Array:
     """Run KF with given position and velocity gains; return the innovation ν (m)."""
-    # The predicted states solve linear equations, so LAPACK computes all of them at once
+    # The predicted states (p, v) solve linear equations, so LAPACK computes all of them at once:
+    # p_i - (1 - k0 - dt k1) p_(i-1) - dt v_(i-1) = Δp + (k0 + dt k1) z_(i-1)
+    # v_i + k1 p_(i-1) - v_(i-1) = Δv + k1 z_(i-1)
     dt = preintegrated_motion.interval_s[1:]
     position_gain = k0[:-1] + dt * k1[:-1]
     measured_m = np.ascontiguousarray(preintegrated_motion.measurement_m.T)
@@ -209,6 +191,7 @@ def compute_innovations_with_gains(
     right_hand_side[..., 1] = preintegrated_motion.delta_velocity_m_s.T
     right_hand_side[..., 1:, 0] += position_gain * measured_m[..., :-1]
     right_hand_side[..., 1:, 1] += k1[:-1] * measured_m[..., :-1]
+    # Coefficients below the unit diagonal: unknown (p or v of each measurement), then distance
     bands = np.zeros((len(k0), 2, 4))
     bands[:-1, 1, 1] = -dt
     bands[:-1, 0, 2] = position_gain - 1.0
@@ -285,9 +268,11 @@ def find_profile_likelihood_interval(
     def find_interval_end(direction: float, search_limit: float) -> float | None:
         other_log_sigma = best_log_sigmas[1]
 
-        # √(decrease of the log-likelihood) is nearly linear in ln σ, so brentq needs few steps
+        # The interval ends where this function is zero. √(decrease of the log-likelihood) is nearly
+        # linear in ln σ, so brentq needs few steps
         @cache
         def compute_log_likelihood_drop_excess(log_sigma_change: float) -> float:
+            # The search for the other parameter starts at the result for the previous change
             nonlocal other_log_sigma
             if log_sigma_change == 0.0:
                 return -max_sqrt_log_likelihood_drop
@@ -308,6 +293,7 @@ def find_profile_likelihood_interval(
             )
 
         max_log_sigma_change = direction * (float(np.log(search_limit)) - best_log_sigmas[0])
+        # Increase the change until the decrease is too large: the end is before this change
         tried_log_sigma_change = min(INITIAL_LOG_SIGMA_SEARCH_STEP, max_log_sigma_change)
         while compute_log_likelihood_drop_excess(tried_log_sigma_change) < 0.0:
             if tried_log_sigma_change == max_log_sigma_change:

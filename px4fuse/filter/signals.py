@@ -345,15 +345,13 @@ def integrate_ned_acceleration(
         )
     is_gap = find_imu_gaps(time_s)
     gap_rows = np.flatnonzero(is_gap)
+    # The sum of gap times is linear between the edges of the gaps, so these times are sufficient
     gap_sum_s = np.cumsum(np.where(is_gap, np.diff(time_s), 0.0))
     gap_edge_rows = np.unique([0, *gap_rows, *(gap_rows + 1), len(time_s) - 1])
     return Acceleration(
         time_s=time_s,
-        acceleration_integral_m_s=np.array(
-            [
-                integrate_cumulatively(values.to_numpy(), time_s)
-                for _, values in acceleration.items()
-            ]
+        acceleration_integral_m_s=np.ascontiguousarray(
+            integrate_cumulatively(acceleration.to_numpy(), time_s).T
         ),
         acceleration_second_moments_m2_s4=segment_acceleration_m_s2.T
         @ segment_acceleration_m_s2
@@ -378,12 +376,9 @@ def compute_mean_step_acceleration(
     and the end (s) of each step.
     """
     step_s = np.diff(step_edges_s)
-    velocity_m_s = np.zeros(len(step_edges_s))
-    for component, integral_m_s in zip(
-        direction, acceleration.acceleration_integral_m_s, strict=True
-    ):
-        if component != 0.0:
-            velocity_m_s += component * np.interp(step_edges_s, acceleration.time_s, integral_m_s)
+    velocity_m_s = np.interp(
+        step_edges_s, acceleration.time_s, acceleration.compute_velocity_change_m_s(direction)
+    )
     cumulative_gap_at_edges_s = np.interp(
         step_edges_s, acceleration.gap_edge_time_s, acceleration.cumulative_gap_s
     )

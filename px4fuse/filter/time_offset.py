@@ -9,6 +9,7 @@ interval (sandwich estimate, White 1982).
 
 from collections.abc import Callable
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -16,7 +17,7 @@ from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import NOT_IN_JSON, Count, NotInJson, NotNegative, Record, Share, Span
-from px4fuse.filter.fitting import NoiseParameters, fit_constant_errors, maximise_likelihood
+from px4fuse.filter.fitting import NoiseParameters, add_noises
 from px4fuse.filter.imu_motion import (
     COARSE_SEARCH_MEASUREMENT_COUNT,
     HEADING_SIGMA_RAD,
@@ -192,21 +193,11 @@ def estimate_time_offset(
     progress("time offset")
     downsampled_motion = imu_motion.downsample(COARSE_SEARCH_MEASUREMENT_COUNT)
     offset_s, _ = imu_motion.search_offset(noise_parameters)
-    offset_sigma_s = 0.0
     search_half_width_s = INITIAL_SEARCH_HALF_WIDTH_S
     for motion in (downsampled_motion, imu_motion):
-        noise_parameters = maximise_likelihood(
-            [motion.make_positions_at_offset(offset_s)],
-            noise_parameters,
-            motion.measurement_weights,
-            fits_outliers=False,
-        ).noise_parameters
+        noise_parameters = motion.fit_noises(offset_s, noise_parameters).noise_parameters
         tested_offsets_s = _make_offset_grid(offset_s, search_half_width_s, FINE_GRID_OFFSET_COUNT)
-        scores = fit_constant_errors(
-            motion.make_position_batches(tested_offsets_s),
-            noise_parameters,
-            motion.measurement_weights,
-        ).compute_scores()[0]
+        scores = motion.fit_at_offsets(tested_offsets_s, noise_parameters).compute_scores()[0]
         offset_s, offset_sigma_s = _fit_minimum_and_sigma(tested_offsets_s, scores)
         likelihood_curve_half_width_s = max(
             LIKELIHOOD_CURVE_HALF_WIDTH_SIGMAS * offset_sigma_s, MIN_LIKELIHOOD_CURVE_HALF_WIDTH_S
@@ -215,30 +206,22 @@ def estimate_time_offset(
     offset_variance_factor = _simulate_variance_increase_by_imu_noise(
         imu_motion, offset_s, noise_parameters, offset_sigma_s**-2.0
     )
-    likelihood_curve_offsets_s, profile_scores, interval_low_s, interval_high_s = (
-        _compute_offset_likelihood_curve(
-            imu_motion,
-            noise_parameters,
-            (tested_offsets_s, scores),
-            offset_s,
-            likelihood_curve_half_width_s,
-            MAX_LOG_LIKELIHOOD_DROP * offset_variance_factor,
-        )
+    curve = _compute_offset_likelihood_curve(
+        imu_motion,
+        noise_parameters,
+        tested_offsets_s,
+        scores,
+        offset_s,
+        likelihood_curve_half_width_s,
+        MAX_LOG_LIKELIHOOD_DROP * offset_variance_factor,
     )
-    has_both_interval_ends = interval_low_s is not None and interval_high_s is not None
-    offset_s = _fit_minimum_and_sigma(likelihood_curve_offsets_s, profile_scores)[0]
+    offset_s = _fit_minimum_and_sigma(curve.offsets_s, curve.scores)[0]
     # IMU samples are averages, so the timing error (half a sample interval, 1 σ) is added
     resolution_s = 0.5 * imu_motion.imu_interval_s
-    interval_limits_s = (
-        likelihood_curve_offsets_s[0] if interval_low_s is None else interval_low_s,
-        likelihood_curve_offsets_s[-1] if interval_high_s is None else interval_high_s,
-    )
-    interval_half_widths_s = np.hypot(np.array(interval_limits_s) - offset_s, 1.96 * resolution_s)
-    interval_low_s = float(offset_s - interval_half_widths_s[0])
-    interval_high_s = float(offset_s + interval_half_widths_s[1])
+    interval_low_s, interval_high_s = curve.widen_interval(offset_s, 1.96 * resolution_s)
     rejection_reason = ""
     if (
-        not has_both_interval_ends
+        None in (curve.low_s, curve.high_s)
         or (interval_high_s - interval_low_s) / 2.0 > MAX_OFFSET_INTERVAL_HALF_WIDTH_S
     ):
         rejection_reason = (
@@ -262,8 +245,8 @@ def estimate_time_offset(
         sigma_s=float(np.hypot(offset_sigma_s * np.sqrt(offset_variance_factor), resolution_s)),
         is_determinable=not rejection_reason,
         reason=rejection_reason,
-        likelihood_curve_offsets_s=applied_offset_s + likelihood_curve_offsets_s,
-        curve_log_likelihood_drops=profile_scores - profile_scores.min(),
+        likelihood_curve_offsets_s=applied_offset_s + curve.offsets_s,
+        curve_log_likelihood_drops=curve.scores - curve.scores.min(),
         parts=parts,
         drift_ppm=drift_ppm,
         drift_sigma_ppm=drift_sigma_ppm,
@@ -274,45 +257,58 @@ def estimate_time_offset(
     )
 
 
+class _LikelihoodCurve(NamedTuple):
+    """-ln p (score) of the positions at time offsets, and an interval (s) around the minimum.
+
+    An end of the interval outside the search range is None.
+    """
+
+    offsets_s: Array
+    scores: Array
+    low_s: float | None
+    high_s: float | None
+
+    def widen_interval(self, offset_s: float, additional_half_width_s: float) -> Span:
+        """Return the interval with an additional independent error."""
+        low_s = self.offsets_s[0] if self.low_s is None else self.low_s
+        high_s = self.offsets_s[-1] if self.high_s is None else self.high_s
+        low_half_width_s, high_half_width_s = np.hypot(
+            [low_s - offset_s, high_s - offset_s], additional_half_width_s
+        ).tolist()
+        return offset_s - low_half_width_s, offset_s + high_half_width_s
+
+
 def _compute_offset_likelihood_curve(
     motion: PositionsAndImuMotion,
     noise_parameters: NoiseParameters,
-    tested_offsets_and_scores: tuple[Array, Array],
+    tested_offsets_s: Array,
+    tested_scores: Array,
     offset_s: float,
     half_width_s: float,
     max_score_increase: float,
-) -> tuple[Array, Array, float | None, float | None]:
+) -> _LikelihoodCurve:
     """Compute -ln p of the positions as a function of the time offset.
 
-    Return tested time offsets (s), -ln p of each, and both ends (s) of an interval around the
-    minimum. An end outside the search range is None. ``tested_offsets_and_scores`` contains time
-    offsets for which -ln p is known.
+    ``tested_scores`` contains -ln p of ``tested_offsets_s``. The curve is widened until it contains
+    both ends of the interval.
     """
-    tested_offsets_s, tested_scores = tested_offsets_and_scores
     while True:
-        likelihood_curve_offsets_s = _make_offset_grid(
-            offset_s, half_width_s, LIKELIHOOD_CURVE_POINT_COUNT
-        )
+        offsets_s = _make_offset_grid(offset_s, half_width_s, LIKELIHOOD_CURVE_POINT_COUNT)
+        # Compute -ln p at other time offsets if the known values cannot be interpolated: the curve
+        # is wider, or the steps are too large
         if (
-            likelihood_curve_offsets_s[0] < tested_offsets_s[0]
-            or likelihood_curve_offsets_s[-1] > tested_offsets_s[-1]
+            offsets_s[0] < tested_offsets_s[0]
+            or offsets_s[-1] > tested_offsets_s[-1]
             or tested_offsets_s[1] - tested_offsets_s[0] > MAX_INTERPOLATED_OFFSET_STEP_S
         ):
             tested_offsets_s = _make_offset_grid(offset_s, half_width_s, FINE_GRID_OFFSET_COUNT)
-            tested_scores = fit_constant_errors(
-                motion.make_position_batches(tested_offsets_s),
-                noise_parameters,
-                motion.measurement_weights,
+            tested_scores = motion.fit_at_offsets(
+                tested_offsets_s, noise_parameters
             ).compute_scores()[0]
-        profile_scores = CubicSpline(tested_offsets_s, tested_scores)(likelihood_curve_offsets_s)
-        interval_low_s, interval_high_s = compute_profile_likelihood_interval(
-            likelihood_curve_offsets_s, profile_scores, max_score_increase
-        )
-        if (
-            None not in (interval_low_s, interval_high_s)
-            or half_width_s >= 2.0 * MAX_TESTED_TIME_OFFSET_S
-        ):
-            return likelihood_curve_offsets_s, profile_scores, interval_low_s, interval_high_s
+        scores = CubicSpline(tested_offsets_s, tested_scores)(offsets_s)
+        interval_s = compute_profile_likelihood_interval(offsets_s, scores, max_score_increase)
+        if None not in interval_s or half_width_s >= 2.0 * MAX_TESTED_TIME_OFFSET_S:
+            return _LikelihoodCurve(offsets_s, scores, *interval_s)
         half_width_s *= 2.0
 
 
@@ -334,6 +330,10 @@ def _simulate_variance_increase_by_imu_noise(
 
     Without IMU noise, the variance is 1 / ``fisher_information``. IMU noise is in the residuals and
     in the velocity, so its effect is not negligible.
+
+    Method: the score (derivative of the log-likelihood) is the inner product of residuals and
+    velocity. Simulated residuals and the velocity noise of the same simulation give the additional
+    variance of the score of each group of segments.
     """
     positions_at_offset = imu_motion.make_positions_at_offset(offset_s)
     is_within_segment = positions_at_offset.is_within_segment
@@ -353,6 +353,7 @@ def _simulate_variance_increase_by_imu_noise(
         noise_parameters.sigma_a_m_s2**2
         * positions_at_offset.process_noise_per_sigma_a_squared[:, is_within_segment]
     )
+    # Noise of Δp and Δv with the covariance Q, drawn as Δp and Δv given Δp
     dp, dv = np.zeros((2, axis_count, noise_series_count, measurement_count - 1))
     dp[..., is_within_segment] = np.sqrt(q00) * draw_normal(interval_count_within_segments)
     dv[..., is_within_segment] = np.sqrt(q11 - q01**2 / q00) * draw_normal(
@@ -371,10 +372,8 @@ def _simulate_variance_increase_by_imu_noise(
             * np.sqrt(positions_at_offset.interval_s[is_within_segment])
             * draw_normal(interval_count_within_segments)
         )
-    positions_at_offset, measurement_variance_m2 = positions_at_offset.divide_sigmas_by_sigma_z(
-        1.0,
-        noise_parameters.random_walk_m,
-        imu_motion.measurement_weights / noise_parameters.sigma_z_m**2,
+    positions_at_offset, measurement_variance_m2 = add_noises(
+        positions_at_offset, noise_parameters, imu_motion.measurement_weights
     )
     residual_and_noise_inner_products = compute_segment_inner_products(
         positions_at_offset,
@@ -413,10 +412,8 @@ def _estimate_flight_part_offsets(
     """
     coarse_offsets_s = offset_s + PART_OFFSET_CHANGES_S
     coarse_offsets_s = coarse_offsets_s[np.abs(coarse_offsets_s) <= MAX_TESTED_TIME_OFFSET_S]
-    segment_scores_at_coarse_offsets = fit_constant_errors(
-        imu_motion.make_position_batches(coarse_offsets_s),
-        noise_parameters,
-        imu_motion.measurement_weights,
+    segment_scores_at_coarse_offsets = imu_motion.fit_at_offsets(
+        coarse_offsets_s, noise_parameters
     ).compute_segment_scores()[0]
     grid_offsets_s = np.linspace(
         coarse_offsets_s[0], coarse_offsets_s[-1], LIKELIHOOD_CURVE_POINT_COUNT
@@ -437,6 +434,8 @@ def _estimate_flight_part_offsets(
             scores_above_minimum.append(scores - scores.min())
     if len(part_offsets) < 2:
         return tuple(part_offsets), None
+    # Log-likelihood ratio: one common time offset against separate time offsets. The terms are in
+    # nats without the effect of IMU noise
     chi_square = 2.0 * float(np.sum(scores_above_minimum, axis=0).min()) / offset_variance_factor
     return tuple(part_offsets), float(chdtrc(len(part_offsets) - 1, chi_square))
 

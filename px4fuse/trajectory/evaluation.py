@@ -249,6 +249,7 @@ def evaluate(
     """
     estimate, estimate_notes = drop_constant_orientation(estimate)
     reference, reference_notes = drop_constant_orientation(reference)
+    # 1. Match the poses in time
     time_offset, offset_warnings, better_offset_s = _choose_time_offset(
         estimate, reference, time_offset_s
     )
@@ -261,6 +262,7 @@ def evaluate(
         max_gap_s=max_gap_s,
         time_offset_s=added_offset_s,
     )
+    # 2. Align. If the user did not choose the alignment, insufficient motion is only a warning
     alignment_reason, is_alignment_given = "The user chose the alignment.", alignment is not None
     if alignment is None:
         alignment, alignment_reason = choose_alignment(matched_estimate, matched_reference)
@@ -279,9 +281,11 @@ def evaluate(
             f"{capitalise_first(error.reason)}. The ATE may be too small, and rotation errors may "
             "be wrong."
         )
+    # 3. Convert the orientations of the estimate to the body axes of the reference
     aligned_estimate, notes = _rotate_to_reference_body(
         _apply_transform(transform, matched_estimate), matched_reference
     )
+    # A constant rotation between other body axes also needs the lever arm between both origins
     if not notes and has_other_body_axes(aligned_estimate, matched_reference):
         matched_estimate, notes = _move_to_reference_body(
             matched_estimate, matched_reference, alignment
@@ -295,13 +299,14 @@ def evaluate(
             f"{estimate.name} is ground truth, but {reference.name} is not. Give the estimate "
             "first, then the reference."
         )
+    # 4. Compute the errors
     distance_m = cumulative_distance(matched_reference.position_m)
     position_error_m = np.linalg.norm(
         aligned_estimate.position_m - matched_reference.position_m, axis=1
     )
     position_statistics = compute_statistics(position_error_m)
     if better_offset_s is not None:
-        # too few poses may match, or they do not move
+        # With the better time offset, too few poses may match, or they do not move
         with suppress(TrajectoryError):
             better_evaluation = evaluate(
                 estimate,
@@ -381,7 +386,7 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
         return "yaw", (
             f"{yaw_text}z is vertical in both frames ({frames_text}), so a tilt counts as an error."
         )
-    scale, scale_reason = 1.0, ""
+    scale = 1.0
     try:
         scale = fit_alignment(estimate.position_m, reference.position_m, "sim3").scale
     except TrajectoryError:
@@ -390,28 +395,31 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
                 f"{yaw_text}motion along a line does not determine all angles, but z is vertical "
                 f"in both frames ({frames_text})."
             )
-    if abs(scale - 1.0) > MAX_SCALE_ERROR:
+    tracks_without_vertical = [
+        track for track in (estimate, reference) if track.kind in _KINDS_WITHOUT_KNOWN_VERTICAL
+    ]
+    se3_text = "Rotation and translation are aligned (6 degrees of freedom): "
+    if not tracks_without_vertical:
+        return "se3", f"{se3_text}the frames {frames_text} have no common vertical direction."
+    cause = "the source of this trajectory is unknown"
+    if tracks_without_vertical[0].kind == "slam":
+        cause = "SLAM uses the frame of the first key frame"
+    frame_reason = (
+        f"the vertical direction of {tracks_without_vertical[0].name} is unknown, because {cause}"
+    )
+    names = [*filter(_MONOCULAR_PATTERN.search, (estimate.name, reference.name))]
+    if names:
+        scale_reason = f"the file name {names[0]} indicates monocular SLAM"
+    elif abs(scale - 1.0) > MAX_SCALE_ERROR:
         scale_reason = (
             f"the scale factor {scale:.3g} differs from 1 by more than {MAX_SCALE_ERROR:.0%}"
         )
-    for track in (reference, estimate):
-        if _MONOCULAR_PATTERN.search(track.name):
-            scale_reason = f"the file name {track.name} indicates monocular SLAM"
-    for track in (estimate, reference):
-        if track.kind in _KINDS_WITHOUT_KNOWN_VERTICAL:
-            cause = "the source of this trajectory is unknown"
-            if track.kind == "slam":
-                cause = "SLAM uses the frame of the first key frame"
-            frame_reason = f"the vertical direction of {track.name} is unknown, because {cause}"
-            if scale_reason:
-                return "sim3", (
-                    "Rotation, translation and scale are aligned (7 degrees of freedom): "
-                    f"{frame_reason}, and {scale_reason}."
-                )
-            break
     else:
-        frame_reason = f"the frames {frames_text} have no common vertical direction"
-    return "se3", f"Rotation and translation are aligned (6 degrees of freedom): {frame_reason}."
+        return "se3", f"{se3_text}{frame_reason}."
+    return "sim3", (
+        "Rotation, translation and scale are aligned (7 degrees of freedom): "
+        f"{frame_reason}, and {scale_reason}."
+    )
 
 
 def _choose_time_offset(
@@ -439,13 +447,14 @@ def _choose_time_offset(
         reason = estimated_offset.reason
         fallback = TimeOffset(offset_s=added_offset_s, is_determinable=False, reason=reason)
         return fallback, [f"{reason} {match_text}"], None
+    time_offset = TimeOffset(offset_s=added_offset_s, is_determinable=True, reason=match_text)
+    # Without an estimate, no other offset is better
     low_s, high_s = estimated_offset.interval_s or (added_offset_s, added_offset_s)
     best_offset_s = estimated_offset.offset_s or added_offset_s
     has_better_offset = (
         not low_s <= added_offset_s <= high_s
         and abs(best_offset_s - added_offset_s) >= MIN_REPORTED_TIME_OFFSET_S
     )
-    time_offset = TimeOffset(offset_s=added_offset_s, is_determinable=True, reason=match_text)
     return time_offset, [], best_offset_s if has_better_offset else None
 
 
@@ -554,6 +563,8 @@ def _rotate_to_reference_body(
     aligned_estimate: Trajectory, reference: Trajectory
 ) -> tuple[Trajectory, tuple[str, ...]]:
     """Remove the constant rotation between camera and vehicle axes, and return a note."""
+    # The body axes differ if only one trajectory is in a camera frame, or if one is from SLAM
+    # (camera axes) and the other one is in a frame of vehicles
     vehicle_frames = (*_Z_DOWN_FRAMES, "ENU")
     body_axes_differ = (aligned_estimate.frame == "camera") != (reference.frame == "camera") or any(
         track.kind == "slam"

@@ -185,7 +185,8 @@ def find_pose_pairs(
     if not all_pairs:
         return _find_consecutive_pairs(np.diff(distance_or_time), delta.value)
     start_indices = np.arange(pose_count - 1)
-    # Rounding errors may change the nearest pose, so its neighbours are tested too
+    # The nearest pose is the first at or above the distance, or the pose before it. Rounding errors
+    # may change the result, so their neighbours are tested too
     nearest_indices = np.searchsorted(distance_or_time, distance_or_time + delta.value)[:-1]
     candidate_indices = np.clip(
         nearest_indices[:, None] + np.arange(-2, 2), start_indices[:, None] + 1, pose_count - 1
@@ -317,6 +318,8 @@ def estimate_rmse_interval(
         0, error_count, (BOOTSTRAP_RESAMPLES, round(block_count))
     )
     resampled_means = block_means[block_starts].mean(axis=1)
+    # With few blocks, the interval between the 2.5 % and 97.5 % quantiles is too narrow. Other
+    # quantiles give the width of a Student t interval with √(n / (n - 1)) bias correction
     student_t_quantile = float(stdtrit(block_count - 1.0, 0.975))
     tail_probability = float(ndtr(-student_t_quantile * np.sqrt(block_count / (block_count - 1.0))))
     limits = np.quantile(resampled_means, [tail_probability, 1.0 - tail_probability])

@@ -238,6 +238,7 @@ def _find_candidate_offsets_s(sparse_track: Trajectory, dense_track: Trajectory)
         moments = compute_moments(
             sparse_values, dense_values, is_sparse_speed_known, is_dense_speed_known
         )
+        # At each lag, the overlap must be long, and both speeds must vary
         is_usable = moments.count >= MIN_OVERLAP_FRACTION * shorter_duration_s / step_s
         # At rest, the variance of the speed is a rounding error
         for values, is_known, square_sum in (
@@ -317,19 +318,21 @@ def _compute_interval_half_width_s(
         velocities
         - similarity_jacobian @ np.linalg.lstsq(similarity_jacobian, velocities, rcond=None)[0]
     )
-    (dense_track_square_sum, cross_product_sum), (_, sparse_track_square_sum) = (
-        residual_velocities.T @ residual_velocities
-    ).tolist()
+    dense_residuals, sparse_residuals = residual_velocities.T
+    dense_track_square_sum = float(dense_residuals @ dense_residuals)
+    sparse_track_square_sum = float(sparse_residuals @ sparse_residuals)
     if (
         dense_track_square_sum
         <= MIN_RESIDUAL_VELOCITY_FRACTION**2 * float((dense_track_velocity_m_s**2).sum())
-        or cross_product_sum
+        or dense_residuals @ sparse_residuals
         <= MIN_RESIDUAL_VELOCITY_CORRELATION
         * (dense_track_square_sum * sparse_track_square_sum) ** 0.5
     ):
         return float("inf")
+    # Derivative of the log-likelihood with respect to the time offset, for each pose. The poses are
+    # correlated, so the variance of the sum contains the products at other lags
     likelihood_score = (
-        residual_velocities[:, 0].reshape(pose_count, 3)
+        dense_residuals.reshape(pose_count, 3)
         * (fit.dense_track_position_m - fit.aligned_position_m)
     ).sum(axis=1)
     # The lags must exceed the correlation length (Newey and West 1987)

@@ -134,8 +134,9 @@ def right_jacobian_inverse(tangent: Array) -> Array:
     theta = np.linalg.norm(tangent[..., _get_dimension(tangent) :], axis=-1)[..., None, None]
     square_term_factor = _compute_square_term_factor(theta)
     half_square_term_factor_slope = 0.5 * _compute_square_term_factor_slope(theta)
-    # Power series of x / (1 - exp(-x)) for the commutator matrix x = ad, with the identity
-    # ad^5 = -2 theta^2 ad^3 - theta^4 ad
+    # x / (1 - exp(-x)) for the commutator matrix x = ad is 1 + x/2 + a x^2 + b x^4: the identity
+    # ad^5 = -2 theta^2 ad^3 - theta^4 ad replaces all higher powers. The sums of their factors are
+    # a = f - theta f'/2 and b = -f'/(2 theta), with the function f of _compute_square_term_factor
     jacobian: Array = (
         np.eye(commutator.shape[-1])
         + 0.5 * commutator

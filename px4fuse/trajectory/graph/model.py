@@ -204,15 +204,15 @@ def _compute_chordal_poses(graph: PoseGraph) -> PoseGraph:
     measured_rotation = lie.rotation_matrix(graph.measurements)
     eye = np.broadcast_to(np.eye(dimension), measured_rotation.shape)
     # Linear least squares for matrices R_i: minimise the weighted sum of |Zᵀ R_iᵀ - R_jᵀ|²
-    unconstrained_matrices = _solve_positions(
+    transposed_matrices = _solve_positions(
         graph,
-        measured_rotation.transpose(0, 2, 1),
-        -eye,
-        rotation_information[:, None, None] * eye,
-        0.0 * measured_rotation,
-        lie.rotation_matrix(graph.poses[0]).T,
+        first_pose_matrix=measured_rotation.transpose(0, 2, 1),
+        second_pose_matrix=-eye,
+        information=rotation_information[:, None, None] * eye,
+        right_hand_side=0.0 * measured_rotation,
+        first_pose=lie.rotation_matrix(graph.poses[0]).T,
     )
-    rotation = _find_nearest_rotations(unconstrained_matrices.transpose(0, 2, 1))
+    rotation = _find_nearest_rotations(transposed_matrices.transpose(0, 2, 1))
     # Residual of an edge with rotation Z and translation z: (R_i Z)ᵀ (t_j - t_i - R_i z)
     first_rotation = rotation[graph.first_nodes]
     predicted_second_rotation = first_rotation @ measured_rotation

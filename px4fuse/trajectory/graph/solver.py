@@ -148,17 +148,15 @@ def _minimise(
         first_pose_jacobian = second_pose_jacobian @ lie.adjoint(
             lie.inverse(residuals.relative_poses)
         )
-        matrix_elements, gradient = graph.normal_equations.assemble(
+        matrix_blocks, gradient = graph.normal_equations.assemble(
             -first_pose_jacobian,
             second_pose_jacobian,
             weights[:, None, None] * graph.information,
             -residuals.residual[..., None],
         )
+        # Increase the damping until a step decreases the cost, or hardly changes it
         while True:
-            cost_decrease = 0.0
-            predicted_decrease = 0.0
-            is_converged = False
-            step = graph.normal_equations.solve(matrix_elements, gradient, damping)
+            step = graph.normal_equations.solve(matrix_blocks, gradient, damping)
             if step is not None:
                 predicted_decrease = 0.5 * float(np.sum(step * (damping * step + gradient)))
                 trial_residuals = model.residuals(
@@ -166,21 +164,22 @@ def _minimise(
                 )
                 cost_decrease = cost - float(np.sum(0.5 * weights * trial_residuals.chi2))
                 is_converged = abs(cost_decrease) < relative_cost_tolerance * cost
-            is_accepted = (
-                predicted_decrease > sys.float_info.epsilon * cost
-                and cost_decrease > _MIN_COST_DECREASE_RATIO * predicted_decrease
-            )
-            if is_accepted or is_converged or damping >= _MAX_DAMPING:
-                break
+                is_accepted = (
+                    predicted_decrease > sys.float_info.epsilon * cost
+                    and cost_decrease > _MIN_COST_DECREASE_RATIO * predicted_decrease
+                )
+                if is_accepted or is_converged:
+                    break
+            if damping >= _MAX_DAMPING:
+                return _Optimum(residuals, iterations, False)
             damping *= _DAMPING_FACTOR
         if not is_accepted:
-            return _Optimum(residuals, iterations, is_converged)
+            return _Optimum(residuals, iterations, True)
         residuals = trial_residuals
-        cost_before = cost
-        cost = cost - cost_decrease
+        cost -= cost_decrease
         iterations += 1
         damping /= _DAMPING_FACTOR
-        if cost_decrease <= max(relative_cost_tolerance * cost_before, _COST_TOLERANCE):
+        if is_converged or cost_decrease <= _COST_TOLERANCE:
             return _Optimum(residuals, iterations, True)
     return _Optimum(residuals, iterations, cost <= _COST_TOLERANCE)
 
@@ -192,6 +191,8 @@ def _solve_gnc(
     can_be_false_closure: BoolArray,
 ) -> tuple[_Optimum, Array]:
     """Reject false closures by graduated non-convexity; return the optimum and the edge weights."""
+    # Quantiles of χ²: an edge with a smaller χ² keeps full weight, and a dropped edge adds a
+    # constant cost. Other edges than closures are never dropped
     half_degrees_of_freedom = model.count_observed_directions(graph.information) / 2.0
     chi2_bound = np.where(
         can_be_false_closure & (half_degrees_of_freedom > 0.0),
@@ -203,6 +204,7 @@ def _solve_gnc(
     def compute_truncated_cost(residuals: Residuals, edge_weights: Array) -> float:
         return 0.5 * float(np.sum(np.where(edge_weights > 0.0, residuals.chi2, cost_if_dropped)))
 
+    # The result depends on the start: try the least-squares optimum and the initial poses
     iteration_count = unweighted_optimum.iterations
     solutions = []
     for initial_residuals in (unweighted_optimum.residuals, start_residuals):
@@ -210,6 +212,7 @@ def _solve_gnc(
         iteration_count += optimum.iterations
         solutions.append((compute_truncated_cost(optimum.residuals, weights), optimum, weights))
     lowest_cost, optimum, weights = min(solutions, key=lambda solution: solution[0])
+    # Restore each dropped closure, smallest χ² first, if this decreases the cost
     dropped_edges = np.flatnonzero(weights == 0.0)
     for edge_index in dropped_edges[np.argsort(optimum.residuals.chi2[dropped_edges])][
         :_MAX_TRIALS_TO_RESTORE_CLOSURES
@@ -329,6 +332,8 @@ def analyse_graph(
     closure_tests: tuple[GateResult, ...] | Unavailable
     try:
         closure_tests = tuple(gate_edges(graph, closure_edges))
+        # If the information matrices seem too large, divide them by the factor and test again. Both
+        # estimates of the factor must be large: false closures enlarge the reduced χ² only
         if (
             reduced_chi2 > reduced_chi2_interval[1]
             and len(closure_tests) >= MIN_CLOSURES_FOR_SCALE_FACTOR
