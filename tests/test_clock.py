@@ -51,7 +51,11 @@ from px4fuse.filter.imu_motion import (
 )
 from px4fuse.filter.likelihood import compute_profile_likelihood_interval
 from px4fuse.filter.signals import Segment
-from px4fuse.filter.time_offset import MAX_P_VALUE_OF_CHANGED_OFFSET, PartOffset, SourceTimeOffset
+from px4fuse.filter.time_offset import (
+    MAX_P_VALUE_OF_CHANGED_OFFSET,
+    FlightPartTimeOffset,
+    SourceTimeOffset,
+)
 from px4fuse.flight.model import (
     ALIGNED_BY_EKF2_ORIGIN,
     GNSS_ORIGIN,
@@ -168,7 +172,7 @@ def test_integrated_constant_acceleration_equals_closed_form() -> None:
         np.flatnonzero(~positions.is_within_segment) + 1, moved.segment_edges[1:-1]
     )
     # positions are relative to the first measured one of each stretch
-    edges = [*positions.segment_starts.tolist(), len(positions.measurement_m)]
+    edges = [*positions.segment_start_indices.tolist(), len(positions.measurement_m)]
     for begin, end in pairwise(edges):
         known = positions.measurement_m[begin:end, 0]
         known = known[np.isfinite(known)]
@@ -499,7 +503,8 @@ def stated(
     *offsets: float, sigma_s: float = 0.02, change_p_value: float | None = 1e-7
 ) -> SourceTimeOffset:
     parts = tuple(
-        PartOffset(30.0 * i, 30.0 * (i + 1), each, sigma_s) for i, each in enumerate(offsets)
+        FlightPartTimeOffset(30.0 * i, 30.0 * (i + 1), each, sigma_s)
+        for i, each in enumerate(offsets)
     )
     middle = float(np.mean(offsets))
     curve = np.array([0.0])

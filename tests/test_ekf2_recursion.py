@@ -32,13 +32,13 @@ from px4fuse.ekf2.intervals import (
     FusionDelays,
     _compute_imu_process_noise,
     _find_fusion_actions,
-    _make_events,
+    _make_fusion_events,
     make_event_intervals,
 )
 from px4fuse.ekf2.model import Ekf2Model, replay_with_settings
-from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, ReplaySegment, add_field_states
+from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, ReplaySegment, add_magnetic_field_states
 from px4fuse.errors import SettingsError
-from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, fill_with_defaults
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, fill_parameters_with_defaults
 from px4fuse.trajectory.rotation import skew
 
 
@@ -351,7 +351,9 @@ def at_rest(
     if field_gauss is not None:
         at, known = np.arange(7, count, 7), np.append(field_gauss, np.zeros(3))
         gauss = np.tile(field_gauss, (len(at), 1))
-        segment = add_field_states(segment, segment.time_s[at], gauss, 1.0, known, np.full(6, 1e-8))
+        segment = add_magnetic_field_states(
+            segment, segment.time_s[at], gauss, 1.0, known, np.full(6, 1e-8)
+        )
         segment.variance[2] = 0.01
     stamp = 10.105 + 0.1 * np.arange(len(measured_m))
     north = np.array(measured_m)
@@ -367,7 +369,7 @@ def at_rest(
         reset_times_s=reset_s,
     )
     inputs = ReplayInputs(
-        fill_with_defaults(settings, aid, *([MAG] if segment.magnetic_field else [])),
+        fill_parameters_with_defaults(settings, aid, *([MAG] if segment.magnetic_field else [])),
         (segment,), vision,
         rules, 0.01, 0.1, 0.01,
         fuses_vision_height=False, imu_offset_m=np.zeros(3), aid=aid,
@@ -488,7 +490,7 @@ def events(
         rules=RULES,
         max_height_fusion_interval_in_position_gap_s=0.25,
     )
-    return _make_events(inputs, stretch_of(100), FusionDelays(delay_s, horizon_s))
+    return _make_fusion_events(inputs, stretch_of(100), FusionDelays(delay_s, horizon_s))
 
 
 def test_ekf2_replay_fuses_each_sample_at_end_of_an_interval():

@@ -39,7 +39,7 @@ from flights import given_placement
 from px4fuse.comparison.flight_events import find_source_gaps
 from px4fuse.comparison.rerun_effects import Rerun, RunStatistics
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
-from px4fuse.filter.frame_rotation import HeadingError, HeadingPart
+from px4fuse.filter.frame_rotation import HeadingError, HeadingErrorInPart
 from px4fuse.filter.frame_rotation import combine_heading_parts as together
 from px4fuse.filter.hypotheses import Estimate, SystematicErrors
 from px4fuse.filter.settings import Settings
@@ -76,7 +76,7 @@ from px4fuse.flight.model import (
     KEPT_BY_EKF2_ORIGIN,
     MOTION_CAPTURE_ORIGIN,
     REBUILT_FROM_INNOVATIONS_ORIGIN,
-    ClockMap,
+    ClockConversion,
     Columns,
     Dropout,
     Reset,
@@ -503,7 +503,9 @@ def test_frd_frame_finding_is_a_note_if_ekf2_fuses_source_yaw(
 
 
 def heading_error(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> HeadingError:
-    parts = (HeadingPart(10.0 * n, 10.0 * n + 10.0, d, sigma_deg) for n, d in enumerate(degrees))
+    parts = (
+        HeadingErrorInPart(10.0 * n, 10.0 * n + 10.0, d, sigma_deg) for n, d in enumerate(degrees)
+    )
     return together(tuple(parts), p, "positions")
 
 
@@ -638,7 +640,7 @@ def bias_of_ekf2(*bias: float) -> dict[str, Any]:
 
 
 def clock_map(method: str = "TIMESYNC", distinct: int | None = None, jitter_s: float = 0.02) -> Any:
-    return ClockMap("UNIX time", method, 600, 0.0, 0.0, jitter_s, "", distinct)
+    return ClockConversion("UNIX time", method, 600, 0.0, 0.0, jitter_s, "", distinct)
 
 
 def at_multiples(multiples: list[int], base_s: float = 0.125, **parts: Any) -> Any:

@@ -146,7 +146,7 @@ def with_constants(offsets: int = 3) -> PositionsAndIncrements:
     initial = np.zeros((COUNT, 2))
     initial[START] = WEAK
     return PositionsAndIncrements(
-        measurement_m=measured, segment_starts=START, interval_s=length,
+        measurement_m=measured, segment_start_indices=START, interval_s=length,
         process_noise_per_sigma_a_squared=0.1
         * np.stack(compute_continuous_process_noise_per_density(length)),
         process_noise_independent_of_sigma_a=np.outer(

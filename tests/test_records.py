@@ -16,7 +16,7 @@ from px4fuse.results.contract import schema
 # Mutable buffers, which are filled while reading, writing or replaying
 BUFFERS = {
     "ArrayEncoder", "Recording", "Topics",
-    "_PdfComparison", "_RunState",
+    "_PdfComparison", "_BatchState",
 }  # fmt: skip
 
 

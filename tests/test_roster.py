@@ -13,9 +13,9 @@ from px4fuse.classroom.assignment.roster import (
     ClassList,
     Person,
     Sheet,
+    read_csv_sheet,
     read_people,
     read_roster,
-    read_sheet,
 )
 from px4fuse.classroom.grading.model import ExportOrigin
 from px4fuse.classroom.grading.outputs import fill_grades, find_grade_column
@@ -68,7 +68,7 @@ def written(tmp_path: Path, content: str | bytes, encoding: str = "utf-8-sig") -
 
 
 def table(tmp_path: Path, text: str, encoding: str = "utf-8-sig") -> Sheet:
-    return read_sheet(written(tmp_path, text, encoding))
+    return read_csv_sheet(written(tmp_path, text, encoding))
 
 
 # -- class lists -----------------------------------------------------------------------------------

@@ -80,7 +80,7 @@ class AlignmentProblem:
 
 
 @dataclass(frozen=True)
-class Match:
+class TrackMatch:
     """Best fit of a position file to a reference track.
 
     Attributes
@@ -123,7 +123,7 @@ class Match:
         )
 
 
-def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
+def find_match(flight: Flight, problem: AlignmentProblem) -> TrackMatch | None:
     """Match a position file with EKF2's position or, if this fails, with the IMU.
 
     If the user gave time offset, frame and yaw, the match only checks these parameters. Return None
@@ -161,7 +161,7 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
     raise NoMatchError("; ".join(dict.fromkeys(reasons)), f"Give {' and '.join(missing_options)}")
 
 
-def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
+def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) -> TrackMatch:
     """Return the match with the reference that has the smallest residual."""
     samples = problem.samples
     if samples.index[-1] - samples.index[0] > MAX_FILE_DURATION_S:
@@ -184,7 +184,7 @@ def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) 
 
 def _match_with_reference(
     reference: SampledTrack, frames: tuple[str, ...], problem: AlignmentProblem
-) -> Match:
+) -> TrackMatch:
     """Fit the file in each frame to a reference, and test the yaw from the user.
 
     The yaw is wrong if only the fit with an estimated yaw is acceptable, or much better.
@@ -200,7 +200,7 @@ def _match_with_reference(
         fit.concordance_correlation < MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference.name]
         or needs_rotation(fit.horizontal_rms_m, fit_with_estimated_yaw, reference.name)
     )
-    return Match(
+    return TrackMatch(
         reference,
         best_frame,
         {frame: fit.residual_rms_m for fit, frame in fits},
@@ -228,7 +228,7 @@ def is_reliable_fit(fit: TrackFit, reference: str) -> bool:
     )
 
 
-def _require_unique_match(match: Match) -> None:
+def _require_unique_match(match: TrackMatch) -> None:
     reference_name = match.reference.name
     fit = match.time_offset_fit
     if fit.concordance_correlation < MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference_name]:
@@ -265,7 +265,9 @@ def _require_unique_match(match: Match) -> None:
             )
 
 
-def _refit_without_origin_resets(flight: Flight, match: Match, problem: AlignmentProblem) -> Match:
+def _refit_without_origin_resets(
+    flight: Flight, match: TrackMatch, problem: AlignmentProblem
+) -> TrackMatch:
     """Fit again to EKF2's position without resets that only moved the origin of its frame.
 
     The first match gives the position of the file at each reset, which is needed to find these.

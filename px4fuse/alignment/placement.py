@@ -15,7 +15,7 @@ from msgspec import structs
 from px4fuse.alignment.matching import (
     MIN_CONCORDANCE_CORRELATION_WITHOUT_WARNING,
     AlignmentProblem,
-    Match,
+    TrackMatch,
     find_match,
     is_reliable_fit,
     needs_rotation,
@@ -34,9 +34,9 @@ from px4fuse.alignment.tracks import (
     make_continuous_ekf2_track,
 )
 from px4fuse.convention.axes import MAX_TIME_OFFSET_S, METRES_PER_UNIT
-from px4fuse.convention.check import check_convention
+from px4fuse.convention.check import determine_source_convention
 from px4fuse.convention.correction import MIN_FRAME_ROTATION_DEG
-from px4fuse.convention.texts import FRAME_AXES, UNIT_NAMES, describe_axes, describe_unit
+from px4fuse.convention.texts import FRAME_AXES, UNIT_NAMES, describe_axes, describe_wrong_unit
 from px4fuse.core.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight.model import (
@@ -73,7 +73,7 @@ def _explain_mismatch(
     # The check uses only the positions of this track
     track = PositionTrack("", POSITION_FILE_ORIGIN, "", position_samples, "unknown", "", ())
     max_time_offset_s = span_s if problem.lag_s is None else MAX_TIME_OFFSET_S
-    convention = check_convention(flight, track, max_time_offset_s)
+    convention = determine_source_convention(flight, track, max_time_offset_s)
     if convention is None or convention.verdict != "determined":
         return None
     faults = []
@@ -81,7 +81,9 @@ def _explain_mismatch(
         stated_unit = next(
             name for unit, name in UNIT_NAMES.items() if METRES_PER_UNIT[unit] == metres_per_unit
         )
-        faults.append(describe_unit(convention.unit, "the positions", stated_unit, is_file=True))
+        faults.append(
+            describe_wrong_unit(convention.unit, "the positions", stated_unit, is_file=True)
+        )
     stated_frame = problem.frames[0].upper() if len(problem.frames) == 1 else ""
     # The axes are multiples of 90°: with another rotation, they do not contradict the stated frame
     is_rotated = abs(convention.rotation_deg) > MIN_FRAME_ROTATION_DEG
@@ -245,7 +247,7 @@ def _apply_alignment(
     flight: Flight,
     recording: PositionRecording,
     problem: AlignmentProblem,
-    match: Match | None,
+    match: TrackMatch | None,
     frame_reason: str,
     yaw_reason: str,
     clock_offset_s: float | None,
@@ -354,7 +356,9 @@ def _compare_with_ekf2(
     return distance_to_ekf2_m, float(np.sum(file_position_m * ekf2_position_m) / norm_product)
 
 
-def _describe_frame_conflict(match: Match, distance_to_ekf2_m: Array | None, yaw_rad: float) -> str:
+def _describe_frame_conflict(
+    match: TrackMatch, distance_to_ekf2_m: Array | None, yaw_rad: float
+) -> str:
     """Describe a frame that is rotated against the reference; empty without such a rotation.
 
     EKF2 shows rotation and origin of the frame, the IMU only the rotation.
@@ -381,7 +385,7 @@ def _describe_frame_conflict(match: Match, distance_to_ekf2_m: Array | None, yaw
     )
 
 
-def _find_warnings(match: Match, is_yaw_estimated: bool) -> Iterator[str]:
+def _find_warnings(match: TrackMatch, is_yaw_estimated: bool) -> Iterator[str]:
     reference_name = match.reference.name
     fit = match.time_offset_fit
     if fit.concordance_correlation < MIN_CONCORDANCE_CORRELATION_WITHOUT_WARNING[reference_name]:

@@ -214,13 +214,13 @@ def fit_by_least_squares(
         all_parameters = parameters.copy()
         all_parameters[is_fitted] = fitted_parameters
         origin_north_m, origin_east_m, lag_correction_s, fitted_yaw_rad = all_parameters
-        reference_at_lag_m = np.interp(
+        reference_position_at_lag_m = np.interp(
             reference_time_s + lag_correction_s, reference.time_s, reference_horizontal_position_m
         )
         residuals_m: ComplexArray = (
             np.exp(1j * fitted_yaw_rad) * file_position_m
             + complex(origin_north_m, origin_east_m)
-            - reference_at_lag_m
+            - reference_position_at_lag_m
         )
         return residuals_m.view(float)
 

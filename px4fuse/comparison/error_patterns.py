@@ -43,7 +43,7 @@ MIN_JITTER_S = 0.008
 # timestamp residual · velocity
 RESIDUAL_TO_JITTER_ERROR_RATIO_LIMITS = 0.6, 1.5
 # Minimum RMS of the position residuals due to jitter ÷ RMS of all position residuals
-MIN_JITTER_PART_OF_RESIDUAL = 0.4
+MIN_JITTER_FRACTION_OF_RESIDUAL = 0.4
 # Jitter, and noise that increases with speed, are reported only above this multiple of their σ
 MIN_SIGNIFICANCE_SIGMAS = 6.0
 # Number of flight parts in which the correlation of noise with speed is tested
@@ -58,7 +58,7 @@ MIN_RMS_DISTANCE_FROM_PATH_MEAN_M = 0.5
 # Length (s) of the running mean that removes drift from the errors of odometry
 DRIFT_WINDOW_S = 12.0
 # Duration (s) of the flight parts whose time offsets are estimated separately
-OFFSET_PART_DURATION_S = 4.0
+FLIGHT_PART_DURATION_FOR_OFFSET_S = 4.0
 # Minimum RMS speed (m/s) of a flight part to estimate its time offset
 MIN_SPEED_FOR_OFFSET_M_S = 0.3
 # Minimum reported variation (s) of the time offset: a position error of 8 cm at 1 m/s
@@ -95,7 +95,7 @@ ROTATION_COMPARISON_TIME_S = 0.1
 MAX_ROTATION_DIFFERENCE_RAD = 0.2
 # A delay of the logged attitude is reported only if its removal reduces the mean square rotation
 # difference between attitude and gyroscopes to less than this fraction
-MAX_REMAINING_ROTATION_DIFFERENCE_RATIO = 0.5
+MAX_ROTATION_DIFFERENCE_RATIO_WITHOUT_DELAY = 0.5
 # In fast flight, minimum speed (m/s) and noise (m) to report noise that increases with speed
 MIN_HIGH_SPEED_M_S, MIN_NOISE_AT_HIGH_SPEED_M = 0.3, 0.02
 # σ of normal noise ÷ median of its absolute values
@@ -180,7 +180,7 @@ class PeriodicError(NamedTuple):
     fraction: float
 
 
-class OffsetVariation(NamedTuple):
+class TimeOffsetVariation(NamedTuple):
     """Range of the time offset of the positions in flight.
 
     Attributes
@@ -197,7 +197,7 @@ class OffsetVariation(NamedTuple):
     most_at_s: float
 
 
-def _rotate_90(vectors: Array) -> Array:
+def _rotate_clockwise_90_deg(vectors: Array) -> Array:
     return vectors[:, ::-1] * [-1.0, 1.0]
 
 
@@ -255,11 +255,13 @@ def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
     ekf2 = comparison.flight.ekf2
     ekf2_speed_m_s = None
     if isinstance(ekf2, Ekf2):
-        logged_speed_m_s = np.linalg.norm(ekf2.state[Columns.VELOCITY[:2]].to_numpy(), axis=1)
+        speed_at_ekf2_times_m_s = np.linalg.norm(
+            ekf2.state[Columns.VELOCITY[:2]].to_numpy(), axis=1
+        )
         ekf2_speed_m_s = np.interp(
             time_s[rows[has_small_interpolation_noise]],
             ekf2.state.index.to_numpy(),
-            logged_speed_m_s,
+            speed_at_ekf2_times_m_s,
         )
     return LocalResiduals(
         compute_residual(position_m),
@@ -289,7 +291,7 @@ def find_timestamp_jitter(errors: LocalResiduals) -> float | None:
         < residual_ratio
         < RESIDUAL_TO_JITTER_ERROR_RATIO_LIMITS[1]
         and residual_ratio > MIN_SIGNIFICANCE_SIGMAS * residual_ratio_sigma
-        and jitter_fraction > MIN_JITTER_PART_OF_RESIDUAL
+        and jitter_fraction > MIN_JITTER_FRACTION_OF_RESIDUAL
     )
     return jitter_s if is_jitter else None
 
@@ -319,7 +321,9 @@ def find_speed_dependent_noise(errors: LocalResiduals) -> SpeedDependentNoise | 
     source_speed_m_s = np.linalg.norm(errors.velocity_m_s, axis=1, keepdims=True)
     direction = errors.velocity_m_s / np.maximum(source_speed_m_s, 1e-6)
     along_track_residual_m = np.abs(np.sum(errors.residual_m * direction, axis=1))
-    cross_track_residual_m = np.abs(np.sum(errors.residual_m * _rotate_90(direction), axis=1))
+    cross_track_residual_m = np.abs(
+        np.sum(errors.residual_m * _rotate_clockwise_90_deg(direction), axis=1)
+    )
     # If the noise increases only along the track, jitter may be the cause: report only noise that
     # increases along and across the track
     if any(
@@ -340,7 +344,9 @@ def find_speed_dependent_noise(errors: LocalResiduals) -> SpeedDependentNoise | 
     return speed_dependent_noise if is_relevant else None
 
 
-def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> ErrorFit | None:
+def fit_errors_against_truth(
+    comparison: Comparison, local_residuals: LocalResiduals
+) -> ErrorFit | None:
     """Fit constant offset, scale, rotation and time offset to the errors against ground truth."""
     truth = comparison.flight.truth
     if isinstance(truth, Unavailable):
@@ -358,7 +364,9 @@ def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> Error
     if path_mean_square_m2 < MIN_RMS_DISTANCE_FROM_PATH_MEAN_M**2:
         return None
     offset_columns = [np.tile(axis, (len(time_s), 1)) for axis in np.eye(2)]
-    columns = np.stack([*offset_columns, path_m, _rotate_90(path_m), -velocity_m_s], axis=-1)
+    columns = np.stack(
+        [*offset_columns, path_m, _rotate_clockwise_90_deg(path_m), -velocity_m_s], axis=-1
+    )
     error_m = position_m - true_m
     parameters, residual_m = _fit_least_squares(columns, error_m)
     # The σ of the scale factor depends on the number of independent errors, not of all errors
@@ -449,11 +457,11 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
     return PeriodicError(1.0 / frequency_hz, amplitude_m, explained_fraction)
 
 
-def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
+def find_time_offset_variation(fit: ErrorFit) -> TimeOffsetVariation | None:
     """Return the range of the time offset in flight if its variation explains the slow errors."""
-    flight_part_indices = np.floor((fit.time_s - fit.time_s[0]) / OFFSET_PART_DURATION_S).astype(
-        int
-    )
+    flight_part_indices = np.floor(
+        (fit.time_s - fit.time_s[0]) / FLIGHT_PART_DURATION_FOR_OFFSET_S
+    ).astype(int)
     square_speed_sums = np.bincount(flight_part_indices, np.sum(fit.velocity_m_s**2, axis=1))
     mean_square_speeds = square_speed_sums / np.maximum(np.bincount(flight_part_indices), 1)
     moving_part_indices = np.flatnonzero(mean_square_speeds > MIN_SPEED_FOR_OFFSET_M_S**2)
@@ -496,9 +504,11 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
         > MAX_REMAINING_SLOW_ERROR_FRACTION * slow_error_mean_square_m2
     ):
         return None
-    times_s = fit.time_s[0] + OFFSET_PART_DURATION_S * (moving_part_indices + 0.5)
+    times_s = fit.time_s[0] + FLIGHT_PART_DURATION_FOR_OFFSET_S * (moving_part_indices + 0.5)
     extreme_indices = [int(np.argmin(offsets_s)), int(np.argmax(offsets_s))]
-    return OffsetVariation(*offsets_s[extreme_indices].tolist(), *times_s[extreme_indices].tolist())
+    return TimeOffsetVariation(
+        *offsets_s[extreme_indices].tolist(), *times_s[extreme_indices].tolist()
+    )
 
 
 def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | None:
@@ -554,5 +564,5 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
     delay_s = ROTATION_INTERVAL_S * delay_in_rows
     is_delay_significant = abs(delay_s) >= MIN_ATTITUDE_DELAY_S and compute_mean_square_rad2(
         delay_in_rows
-    ) < MAX_REMAINING_ROTATION_DIFFERENCE_RATIO * compute_mean_square_rad2(0)
+    ) < MAX_ROTATION_DIFFERENCE_RATIO_WITHOUT_DELAY * compute_mean_square_rad2(0)
     return delay_s if is_delay_significant else None

@@ -11,7 +11,11 @@ from px4fuse.flight.model import Columns, Unavailable
 
 MIN_POSITIONS = 100
 # Minimum and maximum tested frequency (Hz), and maximum tested frequency ÷ rate of the positions
-MIN_FREQUENCY_HZ, MAX_FREQUENCY_HZ, MAX_FREQUENCY_TO_RATE_RATIO = 0.1, 5.0, 0.45
+MIN_OSCILLATION_FREQUENCY_HZ, MAX_OSCILLATION_FREQUENCY_HZ, MAX_FREQUENCY_TO_RATE_RATIO = (
+    0.1,
+    5.0,
+    0.45,
+)
 # The power of a peak at frequency f is compared with the median power from f ÷ ratio to f · ratio
 BAND_LIMIT_RATIO = 1.33
 # Minimum power of a peak ÷ median power: in flights without an oscillation, the ratio is below 6
@@ -72,7 +76,10 @@ def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | Non
     frequencies_hz = np.arange(1, count) / (len(rotation_to_vehicle_axes) * interval_s)
     first, end = np.searchsorted(
         frequencies_hz,
-        [MIN_FREQUENCY_HZ, min(MAX_FREQUENCY_HZ, MAX_FREQUENCY_TO_RATE_RATIO / interval_s)],
+        [
+            MIN_OSCILLATION_FREQUENCY_HZ,
+            min(MAX_OSCILLATION_FREQUENCY_HZ, MAX_FREQUENCY_TO_RATE_RATIO / interval_s),
+        ],
     )
     peaks = 1 + np.flatnonzero(
         (error_power[1:-1] > error_power[:-2]) & (error_power[1:-1] > error_power[2:])

@@ -23,7 +23,7 @@ MAX_FLIGHT_PART_COUNT = 12
 MIN_PART_MEASUREMENTS = 25
 
 
-class NoisyPart(NamedTuple):
+class NoisyFlightPart(NamedTuple):
     """Time span (s) with larger innovations than the rest of the flight.
 
     ``sigma_ratio`` is σ of the innovations in the time span ÷ σ in the rest of the flight.
@@ -83,7 +83,7 @@ def _find_heading_of_largest_noise(north_and_east: Sequence[AxisComparison]) -> 
 
 def find_noisy_flight_part(
     comparison: Comparison, axis_tuning: AxisTuning | Unavailable | None
-) -> NoisyPart | None:
+) -> NoisyFlightPart | None:
     """Find a time span with larger innovations than in the rest of the flight."""
     axes = [axis_result.axis for axis_result in select_north_and_east(comparison)]
     if axis_tuning is None or len(axes) < 2:
@@ -130,7 +130,7 @@ def find_noisy_flight_part(
         return float(np.median(magnitudes[:, is_noisy]) / np.median(magnitudes[:, ~is_noisy]))
 
     innovations_without_outliers = compute_scaled_innovations(np.isin(time_s, outlier_time_s))
-    return NoisyPart(
+    return NoisyFlightPart(
         float(time_s[first_row]),
         float(time_s[end_row - 1]),
         compute_sigma_ratio(scaled_innovations),

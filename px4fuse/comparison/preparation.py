@@ -8,23 +8,23 @@ from msgspec import structs
 
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.projection import find_observation_variance
-from px4fuse.convention.check import check_convention
+from px4fuse.convention.check import determine_source_convention
 from px4fuse.convention.correction import convert_to_px4_convention, find_convention_faults
 from px4fuse.convention.model import Convention
 from px4fuse.core.record import Span
-from px4fuse.core.text import capitalise_first
-from px4fuse.ekf2.fusion_conditions import constant_coordinates
+from px4fuse.core.text import capitalise_first_letter
+from px4fuse.ekf2.fusion_conditions import find_constant_coordinates
 from px4fuse.errors import MissingDataError, SettingsError, suggest_name
 from px4fuse.filter.settings import SETTING_RANGES, Settings, requested_settings
 from px4fuse.filter.signals import (
-    AISLE,
+    AISLE_AXIS,
     MIN_MEASUREMENTS,
     Segment,
     cut_to_segment,
     interpolate_attitude,
     make_axes,
 )
-from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
+from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, MODEL_PARAMETERS
 from px4fuse.flight.model import (
     ALIGNED_BY_EKF2_ORIGIN,
     HEIGHT_ONLY_REASON,
@@ -45,9 +45,9 @@ from px4fuse.readers.px4_innovations import (
     replace_vision_by_gnss_innovations,
 )
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
-from px4fuse.readers.px4_topics import SOURCE_TRACKS
+from px4fuse.readers.px4_topics import SOURCE_TRACK_NAMES
 from px4fuse.request import ComparisonRequest, HeightName
-from px4fuse.trajectory.rotation import to_matrix
+from px4fuse.trajectory.rotation import to_rotation_matrix
 
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
@@ -55,7 +55,7 @@ NO_SEPARATE_TRUTH = Unavailable(
     "Choose another position source for KF with --position-source.",
 )
 # Default axes if the height of the source is constant or too noisy (GNSS)
-HORIZONTAL_AXES = (AISLE, "north", "east")
+HORIZONTAL_AXES = (AISLE_AXIS, "north", "east")
 
 
 def prepare_comparison_inputs(
@@ -95,14 +95,14 @@ def prepare_comparison_inputs(
     segment = choose_segment(flight, source, request.start_s, request.end_s)
     # GNSS heights are noisy, so they are analysed only on request
     is_gnss = source.origin.is_fused_as_gnss
-    has_no_height = is_gnss or "z" in constant_coordinates(source)
+    has_no_height = is_gnss or "z" in find_constant_coordinates(source)
     axis_names = request.axes or (HORIZONTAL_AXES if has_no_height else None)
     axes = make_axes(flight, source, segment, names=axis_names, heading_deg=request.heading_deg)
     if isinstance(flight.truth, Truth) and flight.truth.name == source.name:
         flight = replace(flight, truth=NO_SEPARATE_TRUTH)
     if is_gnss and request.sigma_z_m is None:
         # SIGMA_Z is √R of EKF2's GNSS fusion
-        default_noise_m = PARAMETERS[GNSS_POS.noise].default
+        default_noise_m = MODEL_PARAMETERS[GNSS_POS.noise].default
         sigma_z_m = (
             find_observation_variance(flight, source, axes[0], segment, default_noise_m) ** 0.5
         )
@@ -135,7 +135,9 @@ def _correct_convention(
     its own frame.
     """
     is_in_ned = source.origin.is_gnss or source.origin.route == ALIGNED_BY_EKF2_ORIGIN.route
-    convention = check_convention(flight, source) if is_checked and not is_in_ned else None
+    convention = (
+        determine_source_convention(flight, source) if is_checked and not is_in_ned else None
+    )
     # A time offset from the user replaces the detected one
     if convention is not None and settings.clock_offset_s:
         convention = structs.replace(convention, late_s=0.0)
@@ -208,7 +210,7 @@ def _subtract_lever_arm(track: PositionTrack, flight: Flight) -> PositionTrack:
     if not any(track.lever_arm_m) or isinstance(attitude, Unavailable) or track.frame != "NED":
         return track
     quaternions = interpolate_attitude(attitude, track.samples.index.to_numpy())
-    lever_arm_ned_m = to_matrix(quaternions) @ track.lever_arm_m
+    lever_arm_ned_m = to_rotation_matrix(quaternions) @ track.lever_arm_m
     samples = track.samples.copy()
     samples[Columns.POSITION] -= lever_arm_ned_m
     forward_m, right_m, down_m = track.lever_arm_m
@@ -284,7 +286,7 @@ def _use_barometer_height(
 
 def explain_missing_source(flight: Flight) -> Unavailable:
     """Return the reason why the log has no position source, and the action for the user."""
-    topics = f"{', '.join(SOURCE_TRACKS)}, and EKF2 innovations of external vision"
+    topics = f"{', '.join(SOURCE_TRACK_NAMES)}, and EKF2 innovations of external vision"
     remedy = (
         "set SDLOG_PROFILE to 129 and send the UWB position to PX4 as VISION_POSITION_ESTIMATE, or "
         "give the position file with --position."
@@ -314,7 +316,7 @@ def explain_missing_source(flight: Flight) -> Unavailable:
         reason = f"the file is damaged, and {reason}"
     if flight.log.autopilot != "PX4":
         reason += f"; the autopilot is {flight.log.autopilot}, so there is no EKF2"
-    return Unavailable("position source", reason, capitalise_first(remedy))
+    return Unavailable("position source", reason, capitalise_first_letter(remedy))
 
 
 def _explain_choice(track: PositionTrack) -> str:

@@ -9,7 +9,7 @@ import pandas as pd
 
 from px4fuse.core.arrays import Array
 from px4fuse.ekf2.heights import GNSS_HEIGHT_NOISE_FACTOR
-from px4fuse.filter.signals import AISLE, Axis, Segment, cut_to_segment, weighted_sum
+from px4fuse.filter.signals import AISLE_AXIS, Axis, Segment, cut_to_segment, weighted_sum
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS
 from px4fuse.flight.model import (
     AXIS_NAMES,
@@ -34,7 +34,7 @@ PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
 }
 # Resets are removed from EKF2's track if this reduces the median squared distance between track
 # and measured positions to less than this fraction
-MAX_DISTANCE_RATIO_WITHOUT_RESETS = 0.95
+MAX_SQUARED_DISTANCE_RATIO_WITHOUT_RESETS = 0.95
 
 
 def remove_origin_resets(
@@ -78,7 +78,7 @@ def remove_origin_resets(
             closest_state = min(candidates, key=compute_squared_distance_m2)
             if compute_squared_distance_m2(
                 closest_state
-            ) < MAX_DISTANCE_RATIO_WITHOUT_RESETS * compute_squared_distance_m2(ekf2.state):
+            ) < MAX_SQUARED_DISTANCE_RATIO_WITHOUT_RESETS * compute_squared_distance_m2(ekf2.state):
                 state[columns], texts = closest_state, removed_texts
         texts.append(f"{len(resets)} of {label}")
     statements = (
@@ -209,12 +209,12 @@ def project_innovations(
             "Choose the source that EKF2 fused (--position-source).",
         )
     axis_innovations = []
-    for name in ("north", "east") if axis.name == AISLE else (axis.name,):
+    for name in ("north", "east") if axis.name == AISLE_AXIS else (axis.name,):
         if isinstance(innovations := ekf2.innovations[name], Unavailable):
             return innovations
         axis_innovations.append(innovations)
     rows = cut_to_segment(axis_innovations[0], segment)
-    if axis.name == AISLE:
+    if axis.name == AISLE_AXIS:
         rows = _combine_north_and_east(rows, axis_innovations[1], axis.direction)
     if rows.empty:
         return _make_no_samples_result("EKF2 innovations")

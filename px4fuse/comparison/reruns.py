@@ -31,8 +31,8 @@ from px4fuse.comparison.estimates import Estimates, TuningByAxis
 from px4fuse.comparison.model import (
     AxisComparison,
     Comparison,
-    Difference,
     ErrorsAgainstTruth,
+    FilterDifference,
     FilterName,
     FilterSummary,
     PreparedComparison,
@@ -48,7 +48,7 @@ from px4fuse.comparison.rerun_effects import (
     RIGHT_BIAS_KEY,
     ROTATION_KEY,
     TIME_OFFSET_KEY,
-    Change,
+    ChangedValues,
     Rerun,
     RunStatistics,
     Statistic,
@@ -70,7 +70,7 @@ from px4fuse.filter.signals import (
 )
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL
-from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
 from px4fuse.flight.model import Columns, Spans, Unavailable
 
 # Mean NIS above which innovations are too large for the reported σ
@@ -127,7 +127,7 @@ class _Filter(NamedTuple):
     """KF or EKF2, and a function that re-runs the filter with a change."""
 
     name: FilterName
-    rerun: Callable[[AxisComparison, Change], RunStatistics]
+    rerun: Callable[[AxisComparison, ChangedValues], RunStatistics]
     # For EKF2 only: inputs of the replay, and evaluated time spans (s)
     ekf2_inputs: ReplayInputs | None = None
     evaluated_spans_s: Spans | None = None
@@ -149,7 +149,7 @@ def rerun_filters(
     ):
         replays: dict[frozenset[tuple[str, float]], Ekf2Replay] = {}
 
-        def rerun_ekf2(axis_result: AxisComparison, change: Change) -> RunStatistics:
+        def rerun_ekf2(axis_result: AxisComparison, change: ChangedValues) -> RunStatistics:
             change_key = frozenset(change.items())
             if change_key not in replays:
                 replays[change_key] = _replay_ekf2(comparison, estimates.tuning, model, change)
@@ -204,7 +204,7 @@ def _find_changes_to_test(
     estimates: Estimates,
     ekf2_inputs: ReplayInputs | None,
     axis_result: AxisComparison,
-) -> list[tuple[Change, tuple[Statistic, ...]]]:
+) -> list[tuple[ChangedValues, tuple[Statistic, ...]]]:
     """Return the changes to test along an axis, and the statistics that each change may correct.
 
     ``ekf2_inputs`` is None for KF.
@@ -241,10 +241,10 @@ def _rerun_with_changes(
     changes = _find_changes_to_test(comparison, estimates, tested_filter.ekf2_inputs, axis_result)
     if not changes:
         return []
-    original_statistics, is_logged = _find_statistics_without_change(tested_filter, axis_result)
+    original_statistics, is_logged = _find_statistics_of_unchanged_run(tested_filter, axis_result)
     spans_s = tested_filter.evaluated_spans_s
 
-    def make_rerun(change: Change, discrepancies: Iterable[Statistic]) -> Rerun:
+    def make_rerun(change: ChangedValues, discrepancies: Iterable[Statistic]) -> Rerun:
         changed_statistics = tested_filter.rerun(axis_result, change)
         return Rerun(
             filter=tested_filter.name,
@@ -273,7 +273,7 @@ def _rerun_with_changes(
     return reruns
 
 
-def _find_statistics_without_change(
+def _find_statistics_of_unchanged_run(
     tested_filter: _Filter, axis_result: AxisComparison
 ) -> tuple[RunStatistics, bool]:
     """Return the statistics with which the re-runs of a filter are compared.
@@ -315,7 +315,7 @@ def _summarise_run(
     innovation_m: Array,
     innovation_variance_m2: Array,
     errors: ErrorsAgainstTruth | Unavailable,
-    kf_minus_ekf2: Difference | Unavailable | None,
+    kf_minus_ekf2: FilterDifference | Unavailable | None,
     rejected_fraction: float | None = None,
 ) -> RunStatistics:
     nis = innovation_m**2 / innovation_variance_m2
@@ -334,7 +334,7 @@ def _rotate_direction(direction: Array, rotation_deg: float) -> Array:
 
 
 def _rerun_kf(
-    comparison: Comparison, tuning: TuningByAxis, axis_result: AxisComparison, change: Change
+    comparison: Comparison, tuning: TuningByAxis, axis_result: AxisComparison, change: ChangedValues
 ) -> RunStatistics:
     axis, truth, ekf2_state = axis_result.axis, axis_result.truth, axis_result.ekf2_tracks.state
     kf_settings: dict[str, Any] = {
@@ -374,7 +374,7 @@ def _rerun_kf(
 
 
 def _remove_accelerometer_bias(
-    comparison: Comparison, change: Change
+    comparison: Comparison, change: ChangedValues
 ) -> Acceleration | Unavailable:
     flight, imu = comparison.flight, comparison.flight.imu
     if isinstance(imu, Unavailable):
@@ -387,11 +387,11 @@ def _remove_accelerometer_bias(
 
 
 def _replay_ekf2(
-    comparison: Comparison, tuning: TuningByAxis, model: Ekf2Model, change: Change
+    comparison: Comparison, tuning: TuningByAxis, model: Ekf2Model, change: ChangedValues
 ) -> Ekf2Replay:
     if not change:
         return model.baseline_replay
-    changed_parameters = {name: value for name, value in change.items() if name in PARAMETERS}
+    changed_parameters = {name: value for name, value in change.items() if name in MODEL_PARAMETERS}
     model_with_moved_positions = misalign_positions(
         model, change.get(ROTATION_KEY, 0.0), change.get(TIME_OFFSET_KEY, 0.0)
     )
@@ -414,7 +414,7 @@ def _summarise_replay(
     model: Ekf2Model,
     ekf2_replay: Ekf2Replay,
     axis_result: AxisComparison,
-    change: Change,
+    change: ChangedValues,
 ) -> RunStatistics:
     """Compute the statistics of a replay of EKF2 along one axis.
 

@@ -369,13 +369,13 @@ def _compute_log_likelihoods(
     source_squares = np.maximum(source_squares, 1e-12)
 
     # Mean squares of source minus IMU, with the positions in metres
-    horizontal_residual_m2 = (
+    horizontal_mean_square_residual_m2 = (
         metres_per_unit**2
         * (source_squares[:, first_horizontal_axis] + source_squares[:, second_horizontal_axis])
         + imu_squares_m2[..., :2].sum(axis=2, keepdims=True)
         - 2.0 * metres_per_unit * np.abs(correlation)[..., None]
     ) / 2.0
-    down_residual_m2 = (
+    down_mean_square_residual_m2 = (
         metres_per_unit**2 * source_squares[:, vertical_axis]
         + imu_squares_m2[..., 2:]
         - 2.0 * metres_per_unit * (vertical_sign * products[:, vertical_axis, 2])[..., None]
@@ -383,8 +383,8 @@ def _compute_log_likelihoods(
     log_likelihood_per_residual = 0.5 * (
         np.log(source_squares).sum(axis=1, keepdims=True)
         + 6.0 * np.log(metres_per_unit)
-        - 2.0 * np.log(np.maximum(horizontal_residual_m2, MIN_HORIZONTAL_SIGMA_M**2))
-        - np.log(np.maximum(down_residual_m2, MIN_VERTICAL_SIGMA_M**2))
+        - 2.0 * np.log(np.maximum(horizontal_mean_square_residual_m2, MIN_HORIZONTAL_SIGMA_M**2))
+        - np.log(np.maximum(down_mean_square_residual_m2, MIN_VERTICAL_SIGMA_M**2))
     )
     return log_likelihood_per_residual, np.angle(correlation)
 

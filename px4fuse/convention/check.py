@@ -36,7 +36,7 @@ from px4fuse.convention.motion import (
     integrate_inertial_data,
     replace_heading,
 )
-from px4fuse.convention.orientation import check_orientation
+from px4fuse.convention.orientation import determine_orientation_convention
 from px4fuse.convention.texts import format_axes, format_delay
 from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack
 from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
@@ -60,7 +60,7 @@ MAX_RESIDUAL_TO_NOISE_RATIO = 2.4
 IMU_SECOND_DIFFERENCE_SIGMA_M = 0.05
 # Up to this loss in log-likelihood (nats), EKF2's heading is preferred to the heading of the
 # gyroscopes, because EKF2's heading refers to north
-MAX_LIKELIHOOD_LOSS_WITH_EKF2_HEADING = 20.0
+MAX_LOG_LIKELIHOOD_LOSS_WITH_EKF2_HEADING = 20.0
 # Minimum number of GNSS positions for a fit of the heading of the source's frame
 MIN_GNSS_POSITIONS = 30
 # The heading fitted to GNSS positions is used if the residual is below this fraction of the extent
@@ -72,7 +72,7 @@ MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT = 15.0
 TESTED_CLOCK_DRIFTS = np.linspace(-0.05, 0.05, 21)
 # A low-pass filter of the source replaces the estimated delay if it increases the log-likelihood by
 # more than this value (nats). With simulated delays, the increase is below 3
-MIN_LIKELIHOOD_GAIN_FROM_LOW_PASS = 8.0
+MIN_LOG_LIKELIHOOD_GAIN_FROM_LOW_PASS = 8.0
 # Limits (s) of delays that may be the effect of a low-pass filter
 MIN_LOW_PASS_DELAY_S, MAX_LOW_PASS_DELAY_S = 0.2, 5.0
 # Repeated positions are removed if they are less than this fraction of all positions
@@ -85,7 +85,7 @@ THIRD_DIFFERENCE_VARIANCE = 20.0
 SECOND_DIFFERENCE_VARIANCE = 6.0
 
 
-def check_convention(
+def determine_source_convention(
     flight: Flight, track: PositionTrack, max_time_offset_s: float = MAX_TIME_OFFSET_S
 ) -> Convention | None:
     """Determine axes, unit, clock and orientation of a position source.
@@ -169,7 +169,7 @@ def _rank_convention_hypotheses(
     for hypothesis in hypotheses:
         if (
             hypothesis.heading_from == "EKF2"
-            and hypothesis.score > hypotheses[0].score - MAX_LIKELIHOOD_LOSS_WITH_EKF2_HEADING
+            and hypothesis.score > hypotheses[0].score - MAX_LOG_LIKELIHOOD_LOSS_WITH_EKF2_HEADING
             and hypothesis.is_similar_to(hypotheses[0], SMALL_ROTATION_RAD)
         ):
             other_hypotheses = [other for other in hypotheses if other is not hypothesis]
@@ -192,8 +192,10 @@ def _replace_delay_by_low_pass_filter(
         positions.compute_second_differences(filtered_motion),
         filtered_motion,
     )
-    has_gain = low_pass_hypothesis.score > hypothesis.score + MIN_LIKELIHOOD_GAIN_FROM_LOW_PASS
-    return low_pass_hypothesis if has_gain else hypothesis
+    is_low_pass_better = (
+        low_pass_hypothesis.score > hypothesis.score + MIN_LOG_LIKELIHOOD_GAIN_FROM_LOW_PASS
+    )
+    return low_pass_hypothesis if is_low_pass_better else hypothesis
 
 
 def is_source_fused(flight: Flight) -> bool:
@@ -292,13 +294,14 @@ def _judge_hypothesis(
     """
     if hypothesis.score < MIN_LOG_LIKELIHOOD_GAIN:
         return "not determinable"
-    min_gain_per_sample = (
+    min_log_likelihood_gain_per_sample = (
         MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE_IF_AMBIGUOUS
         if is_ambiguous
         else MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE
     )
     if (
-        hypothesis.score < min_gain_per_sample * hypothesis.independent_residual_count
+        hypothesis.score
+        < min_log_likelihood_gain_per_sample * hypothesis.independent_residual_count
         or hypothesis.min_source_to_imu_displacement_ratio > MAX_SOURCE_TO_IMU_DISPLACEMENT_RATIO
         or hypothesis.max_source_to_imu_displacement_ratio < MIN_SOURCE_TO_IMU_DISPLACEMENT_RATIO
         or compute_residual_ratio(hypothesis, positions) > MAX_RESIDUAL_TO_NOISE_RATIO
@@ -363,7 +366,7 @@ def _estimate_clock_drift(
         positions.compute_second_differences(imu_motion),
         imu_motion,
     )
-    # check_convention tests a removed drift again, with all hypotheses
+    # determine_source_convention tests a removed drift again, with all hypotheses
     if (
         not removed_drift
         and hypothesis.score <= start_hypothesis.score + MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT
@@ -381,7 +384,7 @@ def _check_orientation(
     verdict: ConventionVerdict,
 ) -> OrientationConvention | None:
     """Return the convention of the source's orientation, and the heading error if determinable."""
-    orientation_check_result = check_orientation(
+    orientation_check_result = determine_orientation_convention(
         inertial_data,
         sent_orientation.index.to_numpy(),
         sent_orientation[Columns.QUATERNION].to_numpy(),

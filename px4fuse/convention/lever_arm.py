@@ -14,17 +14,17 @@ from px4fuse.convention.motion import (
 from px4fuse.core.arrays import Array
 from px4fuse.filter.signals import interpolate_attitude
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Truth, Unavailable
-from px4fuse.trajectory.rotation import to_matrix
+from px4fuse.trajectory.rotation import to_rotation_matrix
 from px4fuse.trajectory.scores import compute_autocorrelation_time
 
 # Minimum lever arm (m) that is reported: twice the noise of good UWB (0.1 m)
-MIN_LEVER_ARM_M = 0.2
+MIN_REPORTED_LEVER_ARM_M = 0.2
 # Minimum ratio of a reported lever arm to its σ: noise reaches 1.5
 MIN_LEVER_ARM_SIGMAS = 2.5
 MIN_LEVER_ARM_WITH_TRUTH_M = 0.05
 MIN_LEVER_ARM_SIGMAS_WITH_TRUTH = 5.0
 # Maximum reported lever arm (m): larger values are frame errors of the position source
-MAX_LEVER_ARM_M = 5.0
+MAX_REPORTED_LEVER_ARM_M = 5.0
 # Maximum residual (σ) of a sample in the next fit
 MAX_RESIDUAL_SIGMAS = 3.0
 # Minimum ratio of singular values in the lever arm fit with ground truth
@@ -93,7 +93,7 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
     error_per_radian_m = _rotate(true_positions_m - np.nanmean(true_positions_m, axis=0), 90.0)
     # Columns: lever arm (forward, right), offset (north, east), delay and rotation. Delay and
     # rotation are fitted because they resemble a lever arm
-    attitude_columns = to_matrix(interpolate_attitude(attitude, time_s))[:, :2, :2]
+    attitude_columns = to_rotation_matrix(interpolate_attitude(attitude, time_s))[:, :2, :2]
     offset_columns = np.broadcast_to(np.eye(2), attitude_columns.shape)
     motion_columns = np.stack([velocity_m_s, error_per_radian_m], axis=2)
     design = np.concatenate([attitude_columns, offset_columns, motion_columns], axis=2)
@@ -127,7 +127,11 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
     min_length_m = max(
         MIN_LEVER_ARM_WITH_TRUTH_M, MIN_LEVER_ARM_SIGMAS_WITH_TRUTH * lever_arm.sigma_m
     )
-    return lever_arm if min_length_m < lever_arm.horizontal_length_m < MAX_LEVER_ARM_M else None
+    return (
+        lever_arm
+        if min_length_m < lever_arm.horizontal_length_m < MAX_REPORTED_LEVER_ARM_M
+        else None
+    )
 
 
 def _make_lever_arm(parameters: Array, covariance: Array, rotation_deg: float) -> LeverArm:
@@ -160,7 +164,7 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
         return None
     attitude = inertial_data.compute_attitudes()["EKF2"]
     imu_motion = integrate_imu_motion(inertial_data, attitude)
-    rotation = to_matrix(attitude)[:, :2, :2].reshape(-1, 4)
+    rotation = to_rotation_matrix(attitude)[:, :2, :2].reshape(-1, 4)
     rotation_second_differences = SourceSecondDifferences.from_positions(
         inertial_data.time_s, rotation, imu_motion.time_s
     ).second_differences.reshape(-1, 2, 2)
@@ -212,5 +216,5 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
     # The fit is relative to the IMU, the parameters are relative to the vehicle's origin
     fitted_parameters[:2] += find_imu_position_m(flight)[:2]
     lever_arm = _make_lever_arm(fitted_parameters, covariance, rotation_deg)
-    min_length_m = max(MIN_LEVER_ARM_M, MIN_LEVER_ARM_SIGMAS * lever_arm.sigma_m)
+    min_length_m = max(MIN_REPORTED_LEVER_ARM_M, MIN_LEVER_ARM_SIGMAS * lever_arm.sigma_m)
     return lever_arm if lever_arm.horizontal_length_m > min_length_m else None

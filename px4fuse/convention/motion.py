@@ -34,7 +34,7 @@ from px4fuse.trajectory.rotation import (
     heading,
     multiply,
     rotate,
-    to_matrix,
+    to_rotation_matrix,
     to_rotation_vector,
 )
 
@@ -180,7 +180,7 @@ def integrate_inertial_data(flight: Flight) -> InertialData | None:
         tuple(
             valid_span_s
             for start_s, end_s in airborne_spans_s
-            for valid_span_s in Segment(start_s, end_s, "").cut(gap_free_spans_s)
+            for valid_span_s in Segment(start_s, end_s, "").clip_spans(gap_free_spans_s)
         ),
     )
 
@@ -209,7 +209,7 @@ def _integrate_gyros(rotation_rad: Array, logged_attitude: Array) -> Array:
 
 def _level_attitude(attitude: Array, specific_force_m_s2: Array) -> Array:
     """Correct the tilt of an attitude, so that the mean specific force is vertical."""
-    mean_specific_force_m_s2 = rotate(to_matrix(attitude[:-1]), specific_force_m_s2)
+    mean_specific_force_m_s2 = rotate(to_rotation_matrix(attitude[:-1]), specific_force_m_s2)
     for _ in range(2):
         mean_specific_force_m_s2 = running_mean(
             mean_specific_force_m_s2,
@@ -236,11 +236,11 @@ def running_mean(values: Array, is_valid: BoolArray, width: int) -> Array:
 
 
 def high_pass(values: Array, is_valid: BoolArray) -> Array:
-    high_pass_filtered = values - running_mean(
+    high_pass_filtered_values = values - running_mean(
         values, is_valid, round(HIGH_PASS_WINDOW_S / GRID_INTERVAL_S)
     )
-    high_pass_filtered[~is_valid] = 0.0
-    return high_pass_filtered
+    high_pass_filtered_values[~is_valid] = 0.0
+    return high_pass_filtered_values
 
 
 def compute_second_differences(position: Array, window: int) -> Array:
@@ -253,7 +253,7 @@ def integrate_imu_motion(inertial_data: InertialData, attitude: Array) -> ImuSec
     ``attitude``, shape (n + 1, 4), is a quaternion (w, x, y, z; FRD to NED).
     """
     quaternion_sums = attitude[1:] + attitude[:-1]
-    body_to_ned = to_matrix(
+    body_to_ned = to_rotation_matrix(
         quaternion_sums / np.linalg.norm(quaternion_sums, axis=1, keepdims=True)
     )
     acceleration = body_to_ned @ inertial_data.specific_force_m_s2[..., None] + [

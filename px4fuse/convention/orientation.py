@@ -19,7 +19,7 @@ from px4fuse.trajectory.rotation import (
     heading,
     interpolate,
     multiply,
-    to_matrix,
+    to_rotation_matrix,
 )
 
 IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
@@ -75,7 +75,7 @@ class OrientationCandidate(NamedTuple):
         return self.convention.order, self.convention.frames.replace("ENU", "NWU")
 
 
-def check_orientation(
+def determine_orientation_convention(
     inertial_data: InertialData, time_s: Array, quaternion: Array
 ) -> tuple[OrientationConvention, Array, Array] | None:
     """Determine the quaternion order and frames of a source's orientation.
@@ -170,8 +170,10 @@ def _score_convention(
     heading_difference_rad = np.abs(
         np.angle(heading_difference_phasor * np.exp(-1j * mean_heading_difference_rad))
     )
-    tilt_cosine = np.sum(to_matrix(attitude)[:, 2] * to_matrix(reference_attitude)[:, 2], axis=1)
-    tilt_difference_rad = np.arccos(np.clip(tilt_cosine, -1.0, 1.0))
+    tilt_difference_cosine = np.sum(
+        to_rotation_matrix(attitude)[:, 2] * to_rotation_matrix(reference_attitude)[:, 2], axis=1
+    )
+    tilt_difference_rad = np.arccos(np.clip(tilt_difference_cosine, -1.0, 1.0))
     tilt_difference_deg, heading_difference_deg = np.degrees(
         np.median([tilt_difference_rad, heading_difference_rad], axis=1)
     ).tolist()

@@ -34,7 +34,7 @@ def protect_inputs(*, is_active: bool = True) -> Iterator[None]:
         _input_path_by_file_id.reset(context_token)
 
 
-def add_input(path: Path) -> None:
+def register_input_path(path: Path) -> None:
     """Register an input file or folder, so that no output overwrites it."""
     input_path_by_file_id = _input_path_by_file_id.get()
     if input_path_by_file_id is not None and (identity := _read_file_identity(path)) is not None:

@@ -15,7 +15,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
-from px4fuse.core.input_files import add_input
+from px4fuse.core.input_files import register_input_path
 from px4fuse.errors import LogError, Px4FuseError, suggest_name, to_one_line
 
 if sys.version_info >= (3, 14):
@@ -58,14 +58,14 @@ def check_readable(path: Path, folders: Sequence[Path]) -> None:
     """
     resolved_path = Path(os.path.realpath(path))
     if folders and not any(map(resolved_path.is_relative_to, folders)):
-        folder_names = " or ".join(map(str, folders))
+        folder_names_text = " or ".join(map(str, folders))
         raise LogError(
             f"{display_name(path)} is outside the folders that --root allows",
-            f"Copy the file to {folder_names}.",
+            f"Copy the file to {folder_names_text}.",
         )
 
 
-def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int:
+def get_file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int:
     """Return the size (bytes) of a regular file, and register the file as an input.
 
     Raises
@@ -90,13 +90,13 @@ def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int
         raise error_type(f"{name} is a folder", "Give a file.")
     if not stat.S_ISREG(file_status.st_mode):
         raise error_type(f"{name} is a device, pipe or socket.", "Give a regular file.")
-    add_input(path)
+    register_input_path(path)
     return file_status.st_size
 
 
 def read_head(path: Path, byte_count: int, error_type: type[Px4FuseError]) -> bytes:
     """Read the first ``byte_count`` bytes of a regular file."""
-    file_size(path, error_type)
+    get_file_size(path, error_type)
     return _read_bytes(path, byte_count, error_type, display_name(path))
 
 
@@ -119,7 +119,7 @@ def read_bytes_limited(
         Type ``error_type``: the file cannot be read, is too large or empty.
     """
     name = name or display_name(path)
-    size_bytes = file_size(path, error_type, name)
+    size_bytes = get_file_size(path, error_type, name)
     content = b""
     if size_bytes <= limit_bytes:
         # Python reserves as much memory as is requested, so the limit is not requested at once
@@ -194,9 +194,9 @@ def hash_files(paths: Iterable[Path]) -> dict[str, Path]:
             files = [
                 folder_file
                 for folder_file in list_files_recursively(path)
-                if folder_file.is_file() and file_size(folder_file, LogError) <= limit_bytes
+                if folder_file.is_file() and get_file_size(folder_file, LogError) <= limit_bytes
             ]
-        elif (size_bytes := file_size(path, LogError)) > limit_bytes:
+        elif (size_bytes := get_file_size(path, LogError)) > limit_bytes:
             raise LogError(
                 format_size_limit(display_name(path), size_bytes, limit_bytes), LOG_SIZE_REMEDY
             )

@@ -18,7 +18,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
-from px4fuse.core.text import one_line
+from px4fuse.core.text import shorten_to_line
 from px4fuse.core.threads import ONE_THREAD_ENVIRONMENT
 from px4fuse.errors import Px4FuseError
 
@@ -235,7 +235,7 @@ def _run_and_pickle(function: Callable[[Any], Any], job: Any) -> bytes:
         return pickle.dumps((False, JobFailure("the job exceeded the memory limit for one file.")))
     except Exception as error:  # noqa: BLE001 - the failure of a job is its result
         error_prefix = "" if isinstance(error, Px4FuseError) else f"{type(error).__name__}: "
-        return pickle.dumps((True, JobFailure(one_line(f"{error_prefix}{error}", 300))))
+        return pickle.dumps((True, JobFailure(shorten_to_line(f"{error_prefix}{error}", 300))))
 
 
 def _end_with_parent() -> None:

@@ -12,7 +12,15 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray, compute_median_interval_s
-from px4fuse.core.record import Correlation, Count, NotNegative, PositiveFloat, Record, Share, Span
+from px4fuse.core.record import (
+    Correlation,
+    Count,
+    NonNegativeFloat,
+    PositiveFloat,
+    Record,
+    Share,
+    Span,
+)
 from px4fuse.ekf2.heights import GNSS_HEIGHT_NOISE_FACTOR
 from px4fuse.filter.consistency import Consistency, classify_mean_nis, compute_nis_band
 from px4fuse.flight.ekf2_parameters import AIDS, Aid
@@ -49,7 +57,7 @@ MAX_LOG_INTERVALS_WITHOUT_FUSION = 10.0
 # Maximum relative difference between √R and the noise parameter from which EKF2 computes R
 NOISE_RELATIVE_TOLERANCE = 0.02
 # Minimum height (m) of the evaluation: near the ground, rotor downwash disturbs the barometer
-MIN_HEIGHT_M = 2.0
+MIN_EVALUATION_HEIGHT_M = 2.0
 # Window length (barometer samples) of the running median of the height
 HEIGHT_MEDIAN_FILTER_LENGTH = 11
 
@@ -71,10 +79,10 @@ class AidAxisStatistics(Record, kw_only=True):
 
     samples: Count
     innovation_mean: float
-    innovation_std: NotNegative
+    innovation_std: NonNegativeFloat
     s_sqrt_median: PositiveFloat
     nis_mean: PositiveFloat
-    nis_band: tuple[NotNegative, NotNegative]
+    nis_band: tuple[NonNegativeFloat, NonNegativeFloat]
     sigma_ratio: PositiveFloat
     rejected_fraction: Share
     lag1_autocorrelation: Correlation
@@ -154,7 +162,7 @@ def find_flight_span(flight: Flight) -> Span | Unavailable:
         )
         height_m = (down_m.dropna().iloc[0] if down_m.notna().any() else 0.0) - down_m
         times_above_min_height_s = height_m.index[
-            height_m > min(MIN_HEIGHT_M, height_m.max() / 2.0)
+            height_m > min(MIN_EVALUATION_HEIGHT_M, height_m.max() / 2.0)
         ]
         if len(times_above_min_height_s):
             start, end = times_above_min_height_s[[0, -1]].tolist()
@@ -235,7 +243,9 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
                 bias_p=consistency.bias_p,
                 lag1_autocorrelation=consistency.lag1_autocorrelation,
                 ljung_box_p=consistency.ljung_box_p,
-                change=_find_largest_mean_change(sample_times_s[is_evaluated], nu / np.sqrt(S)),
+                change=_find_largest_innovation_mean_change(
+                    sample_times_s[is_evaluated], nu / np.sqrt(S)
+                ),
             )
     fused_fraction = rejected_fraction = 0.0
     if is_enabled.any():
@@ -270,7 +280,9 @@ def _was_enabled(aid_log: AidLog, times_s: Array) -> BoolArray:
     return sample_step_function(aid_log.enabled, times_s) > 0.0
 
 
-def _find_largest_mean_change(time_s: Array, normalised_innovations: Array) -> Span | None:
+def _find_largest_innovation_mean_change(
+    time_s: Array, normalised_innovations: Array
+) -> Span | None:
     """Return time (s) and size (in √S) of the largest significant change of the mean innovation.
 
     Return None if no change is significant.

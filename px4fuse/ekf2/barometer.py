@@ -17,9 +17,9 @@ from px4fuse.flight.ekf2_parameters import BAROMETER
 from px4fuse.flight.model import GROUND_EFFECT_FLAG, Ekf2, FusionRecord
 
 # Default rate (Hz) at which EKF2 fuses the barometer, PX4 v1.15 and later
-BAROMETER_HZ = 10.0
+BAROMETER_FUSION_RATE_HZ = 10.0
 # Rate (Hz) at which EKF2 fuses the barometer before PX4 v1.15
-BAROMETER_HZ_BEFORE_V1_15 = 15.0
+BAROMETER_FUSION_RATE_HZ_BEFORE_V1_15 = 15.0
 # The sample interval is estimated at each bias update in the log. The median is used only if the
 # interquartile range ÷ median of the estimates is below this value
 MAX_RELATIVE_SPREAD_OF_INTERVALS = 0.1
@@ -57,7 +57,9 @@ def estimate_barometer_interval_s(fusion_record: FusionRecord) -> float:
         if upper_quartile_s - lower_quartile_s < MAX_RELATIVE_SPREAD_OF_INTERVALS * median_s:
             return float(median_s)
     return 1.0 / (
-        BAROMETER_HZ_BEFORE_V1_15 if fusion_record.has_delta_angle_biases else BAROMETER_HZ
+        BAROMETER_FUSION_RATE_HZ_BEFORE_V1_15
+        if fusion_record.has_delta_angle_biases
+        else BAROMETER_FUSION_RATE_HZ
     )
 
 

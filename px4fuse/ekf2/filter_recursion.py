@@ -31,7 +31,7 @@ from px4fuse.ekf2.intervals import (
     NO_ACTION,
     START_FUSION,
     EventIntervals,
-    StepEvents,
+    FusionEvents,
     make_event_intervals,
 )
 from px4fuse.ekf2.magnetometer import (
@@ -114,7 +114,7 @@ class SegmentRun:
 
     segment: ReplaySegment
     configurations: tuple[FilterConfiguration, ...]
-    events: tuple[StepEvents, ...]
+    events: tuple[FusionEvents, ...]
     innovation: Array
     innovation_variance: Array32
     noise: Array32
@@ -168,10 +168,10 @@ def run_segment(  # noqa: PLR0912, PLR0915 (the order of EKF2's fusions in one p
     state_variances = np.empty(states.shape, np.float32)
     states[0], state_variances[0] = x, _get_state_variances(P)
     for event in range(event_count):
-        bias_before_fusion = x[:, ACCELEROMETER_BIAS].copy()
+        accelerometer_bias_before_fusion = x[:, ACCELEROMETER_BIAS].copy()
         bias_covariance = P[:, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS].copy()
         prediction.predict(event, x, P)
-        is_bias_constant = bad_acceleration_flag.until_s > batch.event_time_s[event]
+        is_accelerometer_bias_constant = bad_acceleration_flag.until_s > batch.event_time_s[event]
         for aid, mean_samples, gate, state_slices in mean_sensors:
             if mean_samples.sample_count[event].any():
                 mean_sample = EventSamples(*(quantity[event] for quantity in mean_samples))
@@ -208,11 +208,13 @@ def run_segment(  # noqa: PLR0912, PLR0915 (the order of EKF2's fusions in one p
                 event, batch.event_time_s[event], positions.get_velocity_down_update(event)
             )
         # While EKF2 flags a bad acceleration, its accelerometer bias is constant
-        if is_bias_constant.any():
-            x[is_bias_constant, ACCELEROMETER_BIAS] = bias_before_fusion[is_bias_constant]
-            P[is_bias_constant, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = bias_covariance[
-                is_bias_constant
-            ]
+        if is_accelerometer_bias_constant.any():
+            x[is_accelerometer_bias_constant, ACCELEROMETER_BIAS] = (
+                accelerometer_bias_before_fusion[is_accelerometer_bias_constant]
+            )
+            P[is_accelerometer_bias_constant, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = (
+                bias_covariance[is_accelerometer_bias_constant]
+            )
         states[event + 1], state_variances[event + 1] = x, _get_state_variances(P)
     positions.innovation[~positions.has_action] = np.nan
     positions.innovation_variance[~positions.has_action] = np.nan
@@ -277,9 +279,9 @@ class _Prediction:
             state_change_by_acceleration
             + batch.estimates_attitude[:, None] * state_change_by_attitude_correction
         )
-        gyro_variance = batch.estimates_attitude * batch.parameters["EKF2_GYR_NOISE"] ** 2
+        gyro_noise_variance = batch.estimates_attitude * batch.parameters["EKF2_GYR_NOISE"] ** 2
         self.process_noise = (
-            gyro_variance[:, None, None] * gyro_noise_covariance
+            gyro_noise_variance[:, None, None] * gyro_noise_covariance
             + self.acceleration_variance[events, :, None, None]
             * self.accelerometer_noise_covariance
         )

@@ -180,7 +180,7 @@ def _check_enabling_parameter(positions: UnfusedPositions) -> Iterator[UnmetCond
     yield UnmetCondition("switch", f"{parameter_name} is {parameter_value}", reason, action)
 
 
-def constant_coordinates(source: PositionTrack) -> list[str]:
+def find_constant_coordinates(source: PositionTrack) -> list[str]:
     """Return the names of the coordinates (x, y, z) that are constant in all positions."""
     ranges_m = np.ptp(source.samples[Columns.POSITION].to_numpy(), axis=0)
     is_constant = ranges_m < MIN_RANGE_OF_MEASURED_COORDINATE_M
@@ -189,7 +189,7 @@ def constant_coordinates(source: PositionTrack) -> list[str]:
 
 def is_height_only(source: PositionTrack) -> bool:
     """Return True if a position source measures only the height: x and y are constant."""
-    return {"x", "y"} <= {*constant_coordinates(source)}
+    return {"x", "y"} <= {*find_constant_coordinates(source)}
 
 
 def _check_position_frame(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
@@ -268,7 +268,7 @@ def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
         )
 
 
-def _check_quality(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
+def _check_position_quality(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     """Yield an unmet condition of fusion if the quality of the positions is too small.
 
     EKF2 fuses positions only if several successive positions have a quality of at least
@@ -407,7 +407,7 @@ VISION_FUSION_CHECKS = (
     _check_position_frame,
     _check_position_gap,
     _check_timestamps,
-    _check_quality,
+    _check_position_quality,
     _check_interval,
     _check_alignment,
     _check_gate,

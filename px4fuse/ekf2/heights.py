@@ -39,10 +39,10 @@ MIN_MEASUREMENT_NOISE_SIGMA = 0.01
 GNSS_HEIGHT_NOISE_FACTOR = 1.5
 # EKF2 flags a bad acceleration if height innovations are too large: that of barometer or GNSS must
 # exceed this multiple of √S (vert_innov_test_lim, common.h)
-MIN_HEIGHT_INNOVATION_OF_ONE_SENSOR = 3.0
+MIN_HEIGHT_INNOVATION_SIGMAS_OF_ONE_SENSOR = 3.0
 # For a bad-acceleration flag, the height innovations of both barometer and GNSS must exceed this
 # multiple of √S (vert_innov_test_min, common.h)
-MIN_HEIGHT_INNOVATION_OF_BOTH_SENSORS = 1.0
+MIN_HEIGHT_INNOVATION_SIGMAS_OF_BOTH_SENSORS = 1.0
 
 
 class BadAccelerationFlag:
@@ -134,8 +134,8 @@ def _has_large_height_innovations(barometer_innovation: Array, gnss_innovation: 
     """
     larger_innovation = np.maximum(barometer_innovation, gnss_innovation)
     smaller_innovation = np.minimum(barometer_innovation, gnss_innovation)
-    return (larger_innovation > MIN_HEIGHT_INNOVATION_OF_ONE_SENSOR) & (
-        smaller_innovation > MIN_HEIGHT_INNOVATION_OF_BOTH_SENSORS
+    return (larger_innovation > MIN_HEIGHT_INNOVATION_SIGMAS_OF_ONE_SENSOR) & (
+        smaller_innovation > MIN_HEIGHT_INNOVATION_SIGMAS_OF_BOTH_SENSORS
     )
 
 
@@ -258,7 +258,7 @@ class HeightFilter:
         self.update_records[event, -1, :2] = velocity_down_update
         update_records = self.update_records[max(event - 1, 0) : event + 1]
         innovations = -update_records[:, :, 0] / np.sqrt(update_records[:, :, 1])
-        if (innovations > MIN_HEIGHT_INNOVATION_OF_ONE_SENSOR).any():
+        if (innovations > MIN_HEIGHT_INNOVATION_SIGMAS_OF_ONE_SENSOR).any():
             innovations[:, -2] = np.fmax(innovations[:, -2], innovations[:, -1])
             self.bad_acceleration_flag.update(time_s, innovations[0, :-1], innovations[-1, :-1])
 

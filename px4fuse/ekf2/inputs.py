@@ -33,7 +33,7 @@ from px4fuse.flight.ekf2_parameters import (
     GNSS_VEL,
     MAG,
     Aid,
-    fill_with_defaults,
+    fill_parameters_with_defaults,
     uses_aid_mask,
 )
 from px4fuse.flight.model import (
@@ -51,7 +51,7 @@ from px4fuse.readers.common import find_spans
 from px4fuse.readers.px4_innovations import has_fused_aid, replace_vision_by_gnss_innovations
 from px4fuse.readers.px4_positions import MAX_DOWNSAMPLED_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE_REMEDY
-from px4fuse.trajectory.rotation import conjugate, multiply, rotate, to_matrix
+from px4fuse.trajectory.rotation import conjugate, multiply, rotate, to_rotation_matrix
 
 ANALYSIS_NAME = "EKF2 replay"
 # Note in the log of a simulated flight
@@ -251,10 +251,10 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
         return innovations
     flow_samples = fusion_record.flow if is_gnss else pd.DataFrame()
-    modelled_labels = [GNSS_POS.label, GNSS_VEL.label] if is_gnss else []
-    modelled_labels += [FLOW.label] if len(flow_samples) else []
+    modelled_aid_labels = [GNSS_POS.label, GNSS_VEL.label] if is_gnss else []
+    modelled_aid_labels += [FLOW.label] if len(flow_samples) else []
     if unmodelled_aids := [
-        label for label in fusion_record.other_horizontal_aids if label not in modelled_labels
+        label for label in fusion_record.other_horizontal_aids if label not in modelled_aid_labels
     ]:
         return Unavailable(
             ANALYSIS_NAME,
@@ -330,7 +330,8 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     }
     other_aids = [other_aid for other_aid, is_fused in is_other_aid_fused.items() if is_fused]
     return ReplayInputs(
-        settings=fill_with_defaults(fusion_record.parameters, aid, *other_aids) | lever_arm,
+        settings=fill_parameters_with_defaults(fusion_record.parameters, aid, *other_aids)
+        | lever_arm,
         segments=segments,
         received_positions=received_positions,
         rules=_make_fusion_rules(fusion_record, ekf2.step_s, is_gnss=is_gnss),
@@ -453,7 +454,7 @@ def read_gnss(
         velocity_samples = velocity_samples[is_enabled]
     # EKF2_GPS_DELAY is already subtracted from the times of the track. It is added here, because
     # the replay subtracts it again
-    logged_delay_s = fill_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
+    logged_delay_s = fill_parameters_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
     timestamp_s = position_samples.index.to_numpy() + logged_delay_s
     # Maximum reported position noise (m) that EKF2 uses (gps_control.cpp)
     max_reported_noise_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
@@ -514,7 +515,7 @@ def read_vision(
             interpolate_attitude(orientations, timestamp_s)
             for orientations in (attitude, track.orientation)
         )
-        rotation = to_matrix(multiply(ekf2_attitude, conjugate(source_attitude)))
+        rotation = to_rotation_matrix(multiply(ekf2_attitude, conjugate(source_attitude)))
         position_m = rotate(rotation, position_m)
         variance_m2 = rotate(rotation**2, variance_m2)
     vision_age_s = fusion_record.vision_age_s
@@ -579,7 +580,7 @@ def _read_logged_decisions(
         or innovation_topic(aid) not in ekf2.innovation_topics
     ):
         return rejected_flags, is_reset
-    delay_s = fill_with_defaults(fusion_record.parameters, aid)[aid.delay] * 1e-3
+    delay_s = fill_parameters_with_defaults(fusion_record.parameters, aid)[aid.delay] * 1e-3
     measurement_times_s = timestamp_s - delay_s - 0.5 * ekf2.step_s
     # EKF2 fuses a late sample when it arrives
     earliest_fusion_times_s = np.maximum.accumulate(
@@ -606,9 +607,9 @@ def _read_logged_decisions(
         rejected_flags[begin : max(end - 1, 0)] = 1.0
     may_be_reset_sample = np.isnan(rejected_flags)
     # Logged decisions on single samples
-    sample_rows = find_matching_samples(innovations.index.to_numpy(), measurement_times_s)
-    is_logged = sample_rows >= 0
-    innovations_of_samples = innovations.iloc[sample_rows[is_logged]]
+    innovation_rows = find_matching_samples(innovations.index.to_numpy(), measurement_times_s)
+    is_logged = innovation_rows >= 0
+    innovations_of_samples = innovations.iloc[innovation_rows[is_logged]]
     rejected_flags[is_logged] = innovations_of_samples["rejected"]
     # EKF2 logs innovation 0 for a sample to which it resets its position
     may_be_reset_sample[is_logged] &= (innovations_of_samples["rejected"] > 0.0) | (

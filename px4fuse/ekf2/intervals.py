@@ -47,7 +47,7 @@ DERIVATIVE_COLUMN_COUNT = 11
 COLUMN_OF_DERIVATIVE_BY_ATTITUDE_CORRECTION, COLUMN_OF_DERIVATIVE_BY_ACCELERATION = 9, 10
 
 # One row per event: fusion of a position or, in a gap, of height and heading only
-StepEvents = np.recarray[Any, Any]
+FusionEvents = np.recarray[Any, Any]
 EVENT_DTYPE = np.dtype(
     [
         ("end_step", np.intp),  # prediction step of the event
@@ -78,7 +78,7 @@ class EventIntervals:
         are the state changes by EKF2's attitude correction and by the measured acceleration.
     """
 
-    events: StepEvents
+    events: FusionEvents
     prediction_step_counts: Array
     duration_s: Array
     state_derivatives: Array
@@ -136,7 +136,7 @@ def make_event_intervals(
 
     The number of intervals does not depend on ``delays``.
     """
-    events = _make_events(inputs, segment, delays)
+    events = _make_fusion_events(inputs, segment, delays)
     end_steps = events.end_step
     start_steps = np.append(0, end_steps[:-1])
     return EventIntervals(
@@ -147,7 +147,9 @@ def make_event_intervals(
     )
 
 
-def _make_events(inputs: ReplayInputs, segment: ReplaySegment, delays: FusionDelays) -> StepEvents:
+def _make_fusion_events(
+    inputs: ReplayInputs, segment: ReplaySegment, delays: FusionDelays
+) -> FusionEvents:
     received_positions = inputs.received_positions
     time_s = segment.time_s
     first_row, end_row = np.searchsorted(received_positions.timestamp_s, time_s[[0, -1]])

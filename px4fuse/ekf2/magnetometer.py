@@ -92,12 +92,12 @@ def fuse_mean_sample(
     bias_states : slice, optional
         State indices of the sensor bias (body frame).
     """
-    measured_vector = x[:, measured_states]
+    estimated_vector_ned = x[:, measured_states]
     sample_count, R = mean_sample.sample_count, mean_sample.noise
     H = np.zeros((len(x), mean_sample.value.shape[-1], x.shape[1]))
-    H[:, :, THETA] = mean_sample.ned_to_body_rotation @ skew(measured_vector)
+    H[:, :, THETA] = mean_sample.ned_to_body_rotation @ skew(estimated_vector_ned)
     H[:, :, measured_states] = mean_sample.ned_to_body_rotation @ (np.eye(3) - skew(x[:, THETA]))
-    predicted_value = (H[:, :, measured_states] @ measured_vector[:, :, None])[:, :, 0]
+    predicted_value = (H[:, :, measured_states] @ estimated_vector_ned[:, :, None])[:, :, 0]
     if bias_states is not None:
         H[:, :, bias_states] = np.eye(3)
         predicted_value += x[:, bias_states]

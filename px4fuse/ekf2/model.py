@@ -38,10 +38,10 @@ from px4fuse.ekf2.output_predictor import compute_published_state, sum_attitude_
 from px4fuse.ekf2.replay import (
     HORIZONTAL_AXES,
     MAX_REJECTED_FRACTION_FOR_COMPARISON,
-    Agreement,
     Ekf2Replay,
+    ReplayAgreement,
     compare_with_log,
-    judge_with_logged_rejections,
+    judge_agreement_with_logged_rejections,
 )
 from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
@@ -83,14 +83,14 @@ class Ekf2Model:
     ----------
     baseline_replay : Ekf2Replay
         Replay with the logged parameters.
-    agreement : Agreement
+    agreement : ReplayAgreement
         Agreement of this replay with the log.
     """
 
     flight: Flight
     inputs: ReplayInputs
     baseline_replay: Ekf2Replay
-    agreement: Agreement
+    agreement: ReplayAgreement
     runs: tuple[SegmentRun, ...] = ()
 
 
@@ -112,7 +112,7 @@ def prepare_ekf2_model(
         together with the logged configuration, which is faster.
     """
     # Agreement of the replay that still fused an omitted source, by PX4's name of the source
-    failed_agreement_by_aid: dict[str, Agreement] = {}
+    failed_agreement_by_aid: dict[str, ReplayAgreement] = {}
     while True:
         omitted_aids = {
             name: agreement.doubtful[name] for name, agreement in failed_agreement_by_aid.items()
@@ -133,8 +133,10 @@ def prepare_ekf2_model(
         agreement_with_logged_rejections = compare_with_log(
             model.flight, replay_with_logged_rejections(model)
         )
-        if isinstance(agreement_with_logged_rejections, Agreement):
-            agreement = judge_with_logged_rejections(agreement, agreement_with_logged_rejections)
+        if isinstance(agreement_with_logged_rejections, ReplayAgreement):
+            agreement = judge_agreement_with_logged_rejections(
+                agreement, agreement_with_logged_rejections
+            )
     fields: dict[str, Any] = {"doubtful": {**omitted_aids, **agreement.doubtful}}
     for name, failed_agreement in failed_agreement_by_aid.items():
         field_name = "carried_difference_m" if name == FLOW.name else name
@@ -542,16 +544,16 @@ def compute_delayed_states(run: SegmentRun, configuration_index: int) -> Array:
     rotation_increments_rad = -rotate(body_to_ned, state[:, GYRO_BIAS]) * step_s
     if run.configurations[configuration_index].estimates_attitude:
         rotation_increments_rad -= segment.attitude_correction_rad
-    attitude_error_before_rad, state[:, THETA] = integrate(THETA, rotation_increments_rad)
+    attitude_error_before_step_rad, state[:, THETA] = integrate(THETA, rotation_increments_rad)
     specific_force_ned_m_s2 = rotate(body_to_ned, segment.specific_force_m_s2)
     acceleration = (
-        np.cross(attitude_error_before_rad, specific_force_ned_m_s2)
+        np.cross(attitude_error_before_step_rad, specific_force_ned_m_s2)
         + specific_force_ned_m_s2
         + GRAVITY_M_S2
     )
     acceleration -= rotate(body_to_ned, state[:, ACCELEROMETER_BIAS])
-    velocity_before_m_s, state[:, VELOCITY] = integrate(VELOCITY, acceleration * step_s)
-    mean_velocity_m_s = 0.5 * (velocity_before_m_s + state[:, VELOCITY])
+    velocity_before_step_m_s, state[:, VELOCITY] = integrate(VELOCITY, acceleration * step_s)
+    mean_velocity_m_s = 0.5 * (velocity_before_step_m_s + state[:, VELOCITY])
     state[:, POSITION] = integrate(POSITION, mean_velocity_m_s * step_s)[1]
     states[event_steps] = event_states[1:]
     return states

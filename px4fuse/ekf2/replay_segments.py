@@ -26,7 +26,7 @@ from px4fuse.core.arrays import (
     interpolate_columns,
 )
 from px4fuse.core.record import Span
-from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
 from px4fuse.flight.model import (
     BAD_ACCELERATION_FLAG,
     FLOW_FILTER_NEW_SAMPLE_WEIGHT,
@@ -48,7 +48,7 @@ from px4fuse.trajectory.rotation import (
     interpolate,
     multiply,
     rotate,
-    to_matrix,
+    to_rotation_matrix,
     to_rotation_vector,
 )
 
@@ -374,7 +374,9 @@ def find_replay_segments(
         magnetic_field_start_s, magnetic_field_end_s = _find_magnetometer_3d_fusion_span(
             fusion_record
         )
-    parameter_changes = [change for change in ekf2.parameter_changes if change.name in PARAMETERS]
+    parameter_changes = [
+        change for change in ekf2.parameter_changes if change.name in MODEL_PARAMETERS
+    ]
     boundary_times_s += [magnetic_field_end_s, *(change.time_s for change in parameter_changes)]
     # The limits of the last IMU interval and of the last position are included
     earliest_start_s = max(attitude.index[0], imu_times_s[0] - MIN_IMU_GAP_S, position_times_s[0])
@@ -477,11 +479,11 @@ def compute_internal_to_published_position_ratio(fusion_record: FusionRecord) ->
     eccentricity_squared = ECCENTRICITY**2
     q = 1.0 - eccentricity_squared * np.sin(np.radians(fusion_record.latitude_deg)) ** 2
     # PX4 uses the exponent 2.5 for the meridian radius; the exponent of an ellipsoid is 1.5
-    radii_m = (
+    earth_curvature_radii_m = (
         EQUATORIAL_RADIUS_M * np.array([(1.0 - eccentricity_squared) / q**2.5, q**-0.5])
         + fusion_record.altitude_m
     )
-    return np.append(radii_m / EARTH_RADIUS_M, 1.0)
+    return np.append(earth_curvature_radii_m / EARTH_RADIUS_M, 1.0)
 
 
 def _find_interruption_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
@@ -561,7 +563,7 @@ def _make_segment(
         np.concatenate([[[1.0, 0.0, 0.0, 0.0]], from_rotation_vector(rotation_vectors)])
     )
 
-    def compute_relative_attitude(
+    def compute_rotation_from_end_attitude(
         attitude_samples: pd.DataFrame, lead_time_s: float, end_attitude: Array
     ) -> ArrayPair:
         """Return the times (s) of the samples, and their rotation relative to ``end_attitude``.
@@ -580,11 +582,11 @@ def _make_segment(
 
     # Rotation (in NED) that turns the gyro's integrated attitude into EKF2's published attitude
     rotation_to_published_attitude = interpolate(
-        step_times_s, *compute_relative_attitude(attitude, 0.0, gyro_attitude)
+        step_times_s, *compute_rotation_from_end_attitude(attitude, 0.0, gyro_attitude)
     )
     nominal_attitude = multiply(rotation_to_published_attitude, gyro_attitude)
     # The first state row may be up to 0.1 ms before the first IMU sample
-    state_times_s, error_quaternions = compute_relative_attitude(
+    state_times_s, error_quaternions = compute_rotation_from_end_attitude(
         fusion_record.delayed_state, 1e-4, nominal_attitude
     )
     attitude_error_rad = to_rotation_vector(error_quaternions)
@@ -597,7 +599,7 @@ def _make_segment(
         time_s=step_times_s,
         step_s=step_s,
         # float32 (as in PX4) saves memory: these arrays are the largest
-        body_to_ned=to_matrix(nominal_attitude).astype(np.float32),
+        body_to_ned=to_rotation_matrix(nominal_attitude).astype(np.float32),
         attitude_correction_rad=to_rotation_vector(
             multiply(
                 rotation_to_published_attitude[1:], conjugate(rotation_to_published_attitude[:-1])
@@ -662,7 +664,7 @@ def _add_magnetic_field(
     age_s = fusion_record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     fused_samples_per_row = max(MAG_FUSION_HZ * compute_median_interval_s(sample_times_s), 1.0)
     measurement_times_s = sample_times_s - age_s
-    segment_with_magnetic_field_states = add_field_states(
+    segment_with_magnetic_field_states = add_magnetic_field_states(
         segment,
         measurement_times_s,
         field_gauss.iloc[:, :3].to_numpy(),
@@ -708,7 +710,7 @@ def _compute_mean_magnetic_field(
         row_interval_s + fused_sample_counts * INNOVATION_LOW_PASS_TIME_CONSTANT_S
     )
     previous_innovation_weight = ((1.0 - new_sample_weight) ** fused_sample_counts)[:, None]
-    nu_gauss = (
+    unfiltered_field_innovation_gauss = (
         filtered_field_innovation_gauss[gap_free_rows]
         - previous_innovation_weight * filtered_field_innovation_gauss[gap_free_rows - 1]
     ) / (1.0 - previous_innovation_weight)
@@ -724,17 +726,19 @@ def _compute_mean_magnetic_field(
         _interpolate(delayed_state[names], measurement_times_s)
         for names in (Columns.EARTH_MAGNETIC_FIELD, Columns.BODY_MAGNETIC_FIELD)
     )
-    earth_field_with_attitude_error = earth_field_gauss[:, None] - np.cross(
+    earth_field_with_attitude_error_gauss = earth_field_gauss[:, None] - np.cross(
         segment.attitude_error_rad[step_indices], earth_field_gauss[:, None]
     )
     expected_field_gauss = (
-        np.einsum("ki,kiab,kib->ka", weight, ned_to_body_rotation, earth_field_with_attitude_error)
+        np.einsum(
+            "ki,kiab,kib->ka", weight, ned_to_body_rotation, earth_field_with_attitude_error_gauss
+        )
         + body_field_gauss
     )
     mean_rotation_to_body = np.einsum("ki,kiab->kab", weight, ned_to_body_rotation)
     return SensorSamples(
         step_indices[:, 0],
-        expected_field_gauss - nu_gauss,
+        expected_field_gauss - unfiltered_field_innovation_gauss,
         mean_rotation_to_body,
         fused_sample_counts,
         np.zeros(len(gap_free_rows)),
@@ -806,7 +810,7 @@ def compute_low_pass_weights(
     return np.searchsorted(segment.time_s, measurement_times_s - 1e-9), weight
 
 
-def add_field_states(
+def add_magnetic_field_states(
     segment: ReplaySegment,
     measurement_times_s: Array,
     field_gauss: Array,
@@ -874,9 +878,11 @@ def find_step_ends(
     sample_counts = np.maximum(np.rint(interval_s / median_interval_s), 1.0)
     if sample_counts.mean() <= 1.0 + MAX_LOST_IMU_FRACTION:
         sample_counts[:] = 1.0
-    sample_counts_at_logged_ends = np.append(0.0, np.cumsum(sample_counts))[logged_step_end_indices]
+    sample_numbers_at_logged_step_ends = np.append(0.0, np.cumsum(sample_counts))[
+        logged_step_end_indices
+    ]
     samples_per_step = compute_samples_per_step(
-        configured_step_s, median_interval_s, sample_counts_at_logged_ends
+        configured_step_s, median_interval_s, sample_numbers_at_logged_step_ends
     )
     logged_step_end_index_set = set(logged_step_end_indices.tolist())
     end_indices = []
@@ -914,9 +920,9 @@ def downsample_imu(
     step_end_rotation_rad = np.repeat(
         rotation_rad[step_end_indices], step_end_indices - start_indices, axis=0
     )
-    rotated_increments = velocity_increments - np.cross(
+    rotated_velocity_increments = velocity_increments - np.cross(
         step_end_rotation_rad - middle_rotation_rad, velocity_increments
     )
     return rotation_rad[step_end_indices] - rotation_rad[start_indices], np.add.reduceat(
-        rotated_increments, start_indices, axis=0
+        rotated_velocity_increments, start_indices, axis=0
     )

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
 from px4fuse.core.arrays import Array
-from px4fuse.core.record import Count, NotNegative, Record, Share, one_line_repr
+from px4fuse.core.record import Count, NonNegativeFloat, Record, Share, one_line_repr
 from px4fuse.ekf2.height_samples import HEIGHT_SENSORS
 from px4fuse.ekf2.inputs import find_horizontal_reset_times_s
 from px4fuse.ekf2.model import (
@@ -21,8 +21,8 @@ from px4fuse.ekf2.model import (
 )
 from px4fuse.ekf2.replay import (
     HORIZONTAL_AXES,
-    Agreement,
     Ekf2Replay,
+    ReplayAgreement,
     compute_rmse_to_truth,
     interpolate_component,
     is_inside_spans,
@@ -72,10 +72,10 @@ ADDED_POSITION_SIGMA_M = 0.002
 # Number of repeated replays with added position noise
 REPLAYS_WITH_ADDED_NOISE = 4
 # A replay with a larger rejected fraction is repeated with added position noise
-MIN_REJECTED_FRACTION = 0.02
+MIN_REJECTED_SAMPLE_FRACTION = 0.02
 # Above this rejected fraction, the statistics of a replay are not predictable: they depend on the
 # rejection of single samples
-MAX_REJECTED_FRACTION = 0.35
+MAX_REJECTED_SAMPLE_FRACTION = 0.35
 # EKF2 resets the height after this time (s) without height fusion (hgt_fusion_timeout_max,
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
@@ -93,27 +93,27 @@ class AxisStatistics(Record):
     ``sigma_p_median_m`` is the median reported σ. The mean NIS includes rejected samples.
     """
 
-    nis_mean: NotNegative
-    nis_band: tuple[NotNegative, NotNegative]
-    innovation_std_m: NotNegative
-    sigma_p_median_m: NotNegative | Unavailable
-    position_rmse_to_truth_m: NotNegative | Unavailable
+    nis_mean: NonNegativeFloat
+    nis_band: tuple[NonNegativeFloat, NonNegativeFloat]
+    innovation_std_m: NonNegativeFloat
+    sigma_p_median_m: NonNegativeFloat | Unavailable
+    position_rmse_to_truth_m: NonNegativeFloat | Unavailable
 
 
 class AidStatistics(Record):
     """Innovation statistics of one aiding source."""
 
-    nis_mean: NotNegative
-    nis_band: tuple[NotNegative, NotNegative]
-    innovation_std_m: NotNegative
+    nis_mean: NonNegativeFloat
+    nis_band: tuple[NonNegativeFloat, NonNegativeFloat]
+    innovation_std_m: NonNegativeFloat
     rejected_fraction: Share
-    longest_without_fusion_s: NotNegative
+    longest_without_fusion_s: NonNegativeFloat
 
     @property
     def is_predictable(self) -> bool:
         """True if the model can predict EKF2: few rejections, and no height reset."""
         has_reset = self.longest_without_fusion_s > HEIGHT_TIMEOUT_S
-        return not has_reset and self.rejected_fraction <= MAX_REJECTED_FRACTION
+        return not has_reset and self.rejected_fraction <= MAX_REJECTED_SAMPLE_FRACTION
 
 
 class Ekf2Statistics(Record, kw_only=True, omit_defaults=False):
@@ -145,12 +145,12 @@ class Ekf2Statistics(Record, kw_only=True, omit_defaults=False):
     east: AxisStatistics
     samples: Count
     rejected_fraction: Share
-    longest_without_fusion_s: NotNegative | Unavailable
+    longest_without_fusion_s: NonNegativeFloat | Unavailable
     resets: Count
     heading_error_mean_deg: float | Unavailable = HEADING_NOT_REPLAYED
     heights: Mapping[str, AidStatistics] = {}
     others: Mapping[str, AidStatistics] = {}
-    height_rmse_to_truth_m: NotNegative | Unavailable = HEIGHT_NOT_REPLAYED
+    height_rmse_to_truth_m: NonNegativeFloat | Unavailable = HEIGHT_NOT_REPLAYED
     late: Count = 0
     lost: Count = 0
     is_predictable: bool = True
@@ -181,7 +181,7 @@ class WhatIf:
 
     Attributes
     ----------
-    agreement : Agreement
+    agreement : ReplayAgreement
         Agreement of the replay with the log.
     whatif : tuple of Ekf2Statistics
         Statistics with each set of changed parameters.
@@ -191,7 +191,7 @@ class WhatIf:
         Limitations of the replay.
     """
 
-    agreement: Agreement
+    agreement: ReplayAgreement
     logged: Ekf2Statistics
     replayed: Ekf2Statistics
     whatif: tuple[Ekf2Statistics, ...]
@@ -258,7 +258,7 @@ def what_if(
         agreement=model.agreement,
         logged=_summarise_log(flight, model.baseline_replay, spans_s),
         replayed=_summarise_replay(flight, model.baseline_replay, spans_s),
-        whatif=_mark_unpredictable(model, summaries, spans_s, disable_time_s_by_aid),
+        whatif=_mark_unpredictable_statistics(model, summaries, spans_s, disable_time_s_by_aid),
         evaluated_s=spans_s,
         notes=tuple(notes),
     )
@@ -294,7 +294,7 @@ def make_sweep_values(
     return [float(value) for value in sweep]
 
 
-def _mark_unpredictable(
+def _mark_unpredictable_statistics(
     model: Ekf2Model,
     summaries: Sequence[Ekf2Statistics],
     spans_s: Spans,
@@ -308,7 +308,7 @@ def _mark_unpredictable(
         summary
         for summary in summaries
         if summary.changed
-        and MIN_REJECTED_FRACTION < summary.rejected_fraction <= MAX_REJECTED_FRACTION
+        and MIN_REJECTED_SAMPLE_FRACTION < summary.rejected_fraction <= MAX_REJECTED_SAMPLE_FRACTION
     ]
     changes = [summary.changed for summary in uncertain_summaries]
     summaries_by_seed = [uncertain_summaries]
@@ -343,7 +343,7 @@ def _has_few_rejections(summary: Ekf2Statistics) -> bool:
     rejected_fractions = [aid.rejected_fraction for aid in summary.others.values()]
     if summary.changed:
         rejected_fractions.append(summary.rejected_fraction)
-    return max(rejected_fractions, default=0.0) <= MAX_REJECTED_FRACTION and all(
+    return max(rejected_fractions, default=0.0) <= MAX_REJECTED_SAMPLE_FRACTION and all(
         height.is_predictable for height in summary.heights.values()
     )
 

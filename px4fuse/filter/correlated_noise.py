@@ -40,7 +40,7 @@ MAX_MEASUREMENTS = 2000
 # multiple of the median interval
 MAX_INTERVAL_TO_MEDIAN_INTERVAL_RATIO = 3.0
 # Time constants (s) in the coarse search for time-correlated noise
-COARSE_TAUS_S = (0.2, 0.6, 2.0, 6.0)
+COARSE_CORRELATION_TIMES_S = (0.2, 0.6, 2.0, 6.0)
 # Tested fractions of time-correlated noise in the variance SIGMA_Z², in the coarse search
 COARSE_CORRELATED_VARIANCE_FRACTIONS = (0.12, 0.35, 0.8)
 # Tested multiples of SIGMA_A in the coarse search
@@ -62,7 +62,7 @@ LOW_PASS_TAU_RANGE_S = (0.02, 3.0)
 # Tolerance of ln τ in the search for the time constant of a low pass
 LOG_TAU_TOLERANCE = 0.05
 # Maximum number of positions in the fit to ground truth, to limit computing time
-MAX_TRUTH_MEASUREMENTS = 300
+MAX_MEASUREMENTS_IN_TRUTH_FIT = 300
 # Minimum log-likelihood gain over white noise in the fit to ground truth
 MIN_TRUTH_LIKELIHOOD_GAIN_NATS = 5.0
 # If all position errors (m) are smaller, ground truth is a copy of the positions
@@ -72,7 +72,7 @@ MAX_TRUTH_TIME_DIFFERENCE_S = 0.1
 # Number of flight parts in the fit to ground truth; each has its own time offset
 FLIGHT_PART_COUNT = 12
 # Tested time constants (s) in the fit to ground truth
-TESTED_TAUS_S = np.geomspace(0.3, 80.0, 17)
+TESTED_CORRELATION_TIMES_S = np.geomspace(0.3, 80.0, 17)
 # Tested fractions of time-correlated errors in the error variance, in the fit to ground truth
 TESTED_CORRELATED_FRACTIONS = np.linspace(0.05, 0.999, 20)
 
@@ -255,7 +255,9 @@ def fit_time_correlation(
             correlated_sigma_m=sigma_z_m * fraction**0.5,
             tau_s=tau,
         )
-        for fraction, tau in product(COARSE_CORRELATED_VARIANCE_FRACTIONS, COARSE_TAUS_S)
+        for fraction, tau in product(
+            COARSE_CORRELATED_VARIANCE_FRACTIONS, COARSE_CORRELATION_TIMES_S
+        )
     ]
     # Scores are -ln p of the positions, so the lowest score is the best
     downsampled_motion = imu_motion.downsample(COARSE_SEARCH_MEASUREMENT_COUNT)
@@ -309,22 +311,24 @@ def fit_time_correlation_to_truth(
     outlier_time_s: Array,
     clock_offset_s: float,
     jumps: Sequence[Jump],
-    noise_from_imu: TimeCorrelatedNoise | Unavailable,
+    noise_fitted_with_imu: TimeCorrelatedNoise | Unavailable,
     low_pass: SourceLowPass,
 ) -> TimeCorrelatedNoise | Unavailable:
     """Fit time-correlated noise to the position errors against ground truth.
 
-    Frame errors and time offsets are removed from the errors. ``noise_from_imu`` is returned if its
-    log-likelihood gain over white noise is larger.
+    Frame errors and time offsets are removed from the errors. ``noise_fitted_with_imu`` is returned
+    if its log-likelihood gain over white noise is larger.
 
     Model: the covariance of the errors is σ² ((1 - f) I + f C), with C = exp(-|Δt| / τ). For each
     tested τ and f, the most likely σ² is known in closed form.
     """
     min_likelihood_gain_nats = MIN_TRUTH_LIKELIHOOD_GAIN_NATS
     low_pass_likelihood_gain_nats = low_pass.gain_nats
-    if isinstance(noise_from_imu, TimeCorrelatedNoise):
-        min_likelihood_gain_nats = max(MIN_TRUTH_LIKELIHOOD_GAIN_NATS, noise_from_imu.gain_nats)
-        low_pass_likelihood_gain_nats = noise_from_imu.low_pass_gain_nats
+    if isinstance(noise_fitted_with_imu, TimeCorrelatedNoise):
+        min_likelihood_gain_nats = max(
+            MIN_TRUTH_LIKELIHOOD_GAIN_NATS, noise_fitted_with_imu.gain_nats
+        )
+        low_pass_likelihood_gain_nats = noise_fitted_with_imu.low_pass_gain_nats
     true_track = pd.concat([truth["position_m"] for truth in truths], axis=1).dropna()
     measurement_time_s = np.setdiff1d(axes[0].measurement_time_s, outlier_time_s)
     measurement_time_s = measurement_time_s[
@@ -334,11 +338,11 @@ def fit_time_correlation_to_truth(
         >= 0
     ]
     measurement_time_s = measurement_time_s[
-        :: max(1, -(-len(measurement_time_s) // MAX_TRUTH_MEASUREMENTS))
+        :: max(1, -(-len(measurement_time_s) // MAX_MEASUREMENTS_IN_TRUTH_FIT))
     ]
     position_count = len(measurement_time_s)
     if position_count < MIN_MEASUREMENTS:
-        return noise_from_imu
+        return noise_fitted_with_imu
     measured_m = np.transpose(
         [axis.measurement_m[np.isin(axis.measurement_time_s, measurement_time_s)] for axis in axes]
     )
@@ -364,7 +368,7 @@ def fit_time_correlation_to_truth(
     ]
     residuals = basis_without_systematic_errors.T @ (measured_m - true_m)
     if np.abs(residuals).max() < MAX_RESIDUAL_OF_COPIED_TRUTH_M:
-        return noise_from_imu
+        return noise_fitted_with_imu
     white_noise_score = 0.5 * len(residuals) * np.log(np.mean(residuals**2, axis=0)).sum()
 
     @cache
@@ -388,11 +392,12 @@ def fit_time_correlation_to_truth(
 
     # First test every fourth time constant: most flights have no time-correlated noise
     coarse_score = min(
-        compute_scores_and_variances(tau)[0].min() for tau in TESTED_TAUS_S[::4].tolist()
+        compute_scores_and_variances(tau)[0].min()
+        for tau in TESTED_CORRELATION_TIMES_S[::4].tolist()
     )
     if white_noise_score - coarse_score < min_likelihood_gain_nats / 2.0:
-        return noise_from_imu
-    scores_and_variances = [*map(compute_scores_and_variances, TESTED_TAUS_S.tolist())]
+        return noise_fitted_with_imu
+    scores_and_variances = [*map(compute_scores_and_variances, TESTED_CORRELATION_TIMES_S.tolist())]
     # Rows are time constants, columns time-correlated fractions of the variance
     scores, normalised_mean_squares = np.transpose(scores_and_variances, (1, 0, 2))
     tau_index, correlated_fraction_index = divmod(
@@ -401,12 +406,12 @@ def fit_time_correlation_to_truth(
     likelihood_gains_nats = white_noise_score - scores.min(axis=1)
     best_gain_nats = likelihood_gains_nats.max()
     if best_gain_nats < min_likelihood_gain_nats:
-        return noise_from_imu
+        return noise_fitted_with_imu
     first_tau_index, last_tau_index = np.flatnonzero(
         likelihood_gains_nats > best_gain_nats - MAX_LOG_LIKELIHOOD_DROP
     )[[0, -1]]
     # Each end of the 95 % interval of τ is between two tested values of τ: return the outer value
-    taus_s = [*TESTED_TAUS_S.tolist(), np.inf]
+    taus_s = [*TESTED_CORRELATION_TIMES_S.tolist(), np.inf]
     fraction = float(TESTED_CORRELATED_FRACTIONS[correlated_fraction_index])
     variance_m2 = float(normalised_mean_squares[tau_index, correlated_fraction_index])
     return TimeCorrelatedNoise(

@@ -337,7 +337,7 @@ def convert_to_positions_and_increments(
     return subtract_smooth_path(
         PositionsAndIncrements(
             measurement_m=measured_m,
-            segment_starts=np.array([0]),
+            segment_start_indices=np.array([0]),
             interval_s=preintegrated_motion.interval_s,
             process_noise_per_sigma_a_squared=preintegrated_motion.process_noise_per_sigma_a_squared.T,
             process_noise_independent_of_sigma_a=preintegrated_motion.process_noise_independent_of_sigma_a.T,

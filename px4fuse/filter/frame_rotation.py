@@ -13,7 +13,7 @@ from msgspec import structs
 from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array, compute_median_interval_s
-from px4fuse.core.record import NotNegative, Record, Share
+from px4fuse.core.record import NonNegativeFloat, Record, Share
 from px4fuse.filter.fitting import NoiseParameters, fit_constant_errors, maximise_likelihood
 from px4fuse.filter.imu_motion import (
     MAX_IMU_INTERVAL_S,
@@ -56,16 +56,16 @@ HEADING_SIGMA_RAD = 1.0
 MIN_TRUE_TO_MEASURED_SCALE = 0.1
 # Index of the heading error in the constant errors. Its index in the IMU increments is larger by 1,
 # because index 0 is the motion itself
-HEADING_ERROR_INDEX = 2
+HEADING_INDEX_IN_CONSTANT_ERRORS = 2
 
 
-class HeadingPart(Record):
+class HeadingErrorInPart(Record):
     """Heading error (°) in one part of the flight: yaw of the source frame relative to EKF2."""
 
     start_s: float
     end_s: float
     heading_error_deg: float
-    sigma_deg: NotNegative
+    sigma_deg: NonNegativeFloat
 
 
 class HeadingError(Record):
@@ -86,13 +86,13 @@ class HeadingError(Record):
     """
 
     misalignment_deg: float
-    sigma_deg: NotNegative
+    sigma_deg: NonNegativeFloat
     drifts: bool
-    parts: tuple[HeadingPart, ...]
+    parts: tuple[HeadingErrorInPart, ...]
     drift_p: Share
     by: Literal["orientation", "positions"]
 
-    def find_extreme_parts(self) -> tuple[HeadingPart, HeadingPart]:
+    def find_extreme_parts(self) -> tuple[HeadingErrorInPart, HeadingErrorInPart]:
         """Return flight parts with the smallest and the largest misalignment, in time order."""
         heading_errors_deg = [heading_part.heading_error_deg for heading_part in self.parts]
         first_index, last_index = sorted(
@@ -102,7 +102,7 @@ class HeadingError(Record):
 
 
 def combine_heading_parts(
-    parts: tuple[HeadingPart, ...],
+    parts: tuple[HeadingErrorInPart, ...],
     drift_p_value: float,
     method: Literal["orientation", "positions"],
 ) -> HeadingError:
@@ -184,7 +184,7 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
 
 def _average_flight_parts(
     time_s: Array, misalignment_rad: Array, sigma_rad: float
-) -> tuple[HeadingPart, ...]:
+) -> tuple[HeadingErrorInPart, ...]:
     """Average yaw misalignment (rad) over flight parts of equal duration.
 
     σ is not reduced by averaging, because errors in one part are correlated.
@@ -202,7 +202,7 @@ def _average_flight_parts(
     part_edges_s = np.linspace(time_s[0], time_s[-1], part_count + 1)[1:-1]
     rows_by_part = np.split(np.arange(len(time_s)), np.searchsorted(time_s, part_edges_s))
     return tuple(
-        HeadingPart(
+        HeadingErrorInPart(
             start_s=float(time_s[part_rows[0]]),
             end_s=float(time_s[part_rows[-1]]),
             heading_error_deg=float(np.degrees(misalignment_rad[part_rows].mean())),
@@ -331,7 +331,7 @@ def _estimate_heading_error_from_positions(
     chi_square = float(np.sum(deviation_rad**2 / heading_variance_rad2))
     is_drift_tested = len(heading_variance_rad2) > 1 and not has_constant_heading
     return combine_heading_parts(
-        tuple(HeadingPart(*row) for row in heading_part_fields.tolist()),
+        tuple(HeadingErrorInPart(*row) for row in heading_part_fields.tolist()),
         float(chdtrc(len(heading_variance_rad2) - 1, chi_square)) if is_drift_tested else 1.0,
         "positions",
     )
@@ -349,7 +349,7 @@ def _fit_heading_errors(
         positions_and_increments.delta_velocity_m_s,
     ):
         north_m, east_m = increments[:, :, -1]
-        increments[:, :, 1 + HEADING_ERROR_INDEX] = -east_m, north_m
+        increments[:, :, 1 + HEADING_INDEX_IN_CONSTANT_ERRORS] = -east_m, north_m
     noise_parameters = maximise_likelihood(
         [positions_and_increments],
         noise_parameters,
@@ -366,6 +366,7 @@ def _fit_heading_errors(
     true_to_measured_scale = np.maximum(1.0 - constant_errors[:, -1], MIN_TRUE_TO_MEASURED_SCALE)
     return (
         noise_parameters,
-        constant_errors[:, HEADING_ERROR_INDEX] / true_to_measured_scale,
-        covariance[:, HEADING_ERROR_INDEX, HEADING_ERROR_INDEX] / true_to_measured_scale**2,
+        constant_errors[:, HEADING_INDEX_IN_CONSTANT_ERRORS] / true_to_measured_scale,
+        covariance[:, HEADING_INDEX_IN_CONSTANT_ERRORS, HEADING_INDEX_IN_CONSTANT_ERRORS]
+        / true_to_measured_scale**2,
     )

@@ -64,12 +64,12 @@ OUTLIER_RETEST_DURATION_AFTER_JUMP_S = 6.0
 # Maximum false alarm probability of a jump, per flight
 MAX_JUMP_FALSE_ALARM_P = 1e-3
 # Probability that a good measurement near a jump is classified as an outlier
-MAX_FALSE_OUTLIER_P = 1e-3
+MAX_FALSE_OUTLIER_PROBABILITY = 1e-3
 # Maximum number of measurement times at which a detected jump is tested, to locate the jump
 MAX_CANDIDATE_JUMP_TIMES = 6
 MAX_JUMPS = 3
 # Minimum accelerometer bias (m/s²) that is reported: half of EKF2_ABL_LIM
-MIN_BIAS_M_S2 = 0.2
+MIN_REPORTED_ACCELEROMETER_BIAS_M_S2 = 0.2
 # Minimum ratio of a reported accelerometer bias to its σ
 MIN_BIAS_TO_SIGMA_RATIO = 4.0
 MIN_MEASUREMENTS_BEFORE_AND_AFTER_JUMP = 8
@@ -129,7 +129,9 @@ class SystematicErrors:
 
     def has_significant_bias(self) -> bool:
         bias = self.compute_horizontal_bias()
-        return bias.value >= max(MIN_BIAS_M_S2, MIN_BIAS_TO_SIGMA_RATIO * bias.sigma)
+        return bias.value >= max(
+            MIN_REPORTED_ACCELEROMETER_BIAS_M_S2, MIN_BIAS_TO_SIGMA_RATIO * bias.sigma
+        )
 
 
 def estimate_mean_acceleration_error(axis: Axis) -> float | None:
@@ -395,7 +397,7 @@ def _locate_jump(
     is_after_jump = ~is_near_jump & _is_in_window(
         time_s, jump.time_s, OUTLIER_RETEST_DURATION_AFTER_JUMP_S
     )
-    max_residual_square = chdtri(design_matrix.axis_count, MAX_FALSE_OUTLIER_P)
+    max_residual_square = chdtri(design_matrix.axis_count, MAX_FALSE_OUTLIER_PROBABILITY)
 
     def test_for_outliers(jump_time_s: float) -> BoolArray:
         # Measurements near the jump may be outliers, so the fit omits them
@@ -406,10 +408,13 @@ def _locate_jump(
     # outliers. Then test each time near the jump, with the measurements near it
     is_skipped = np.where(is_after_jump, test_for_outliers(jump.time_s), is_skipped)
     candidate_times_s = time_s[is_near_jump]
-    is_used_outlier = is_skipped & ~is_near_jump
+    is_skipped_away_from_jump = is_skipped & ~is_near_jump
     best_indices = np.argsort(
         -_compute_jump_chi_squares(
-            design_matrix, design_matrix.fit(is_used_outlier), is_used_outlier, candidate_times_s
+            design_matrix,
+            design_matrix.fit(is_skipped_away_from_jump),
+            is_skipped_away_from_jump,
+            candidate_times_s,
         )
     )[:MAX_CANDIDATE_JUMP_TIMES]
     outlier_mask_by_jump_time = {

@@ -51,7 +51,7 @@ from px4fuse.trajectory.rotation import (
     multiply,
     rotate,
     skew,
-    to_matrix,
+    to_rotation_matrix,
     to_rotation_vector,
 )
 
@@ -157,8 +157,8 @@ class PositionsAndImuMotion:
             np.arange(len(self.time_s)) % max(1, round(len(self.time_s) / max_measurement_count))
             == 0
         )
-        kept_counts = np.add.reduceat(is_kept.astype(int), self.segment_edges[:-1])
-        has_enough_measurements = kept_counts >= MIN_KEPT_MEASUREMENTS
+        kept_measurement_counts = np.add.reduceat(is_kept.astype(int), self.segment_edges[:-1])
+        has_enough_measurements = kept_measurement_counts >= MIN_KEPT_MEASUREMENTS
         if not has_enough_measurements.any():
             return self
         is_kept &= np.repeat(has_enough_measurements, np.diff(self.segment_edges))
@@ -167,7 +167,7 @@ class PositionsAndImuMotion:
             time_s=self.time_s[is_kept],
             measurement_m=self.measurement_m[is_kept],
             measurement_weights=self.measurement_weights[is_kept],
-            segment_edges=np.cumsum([0, *kept_counts[has_enough_measurements]]),
+            segment_edges=np.cumsum([0, *kept_measurement_counts[has_enough_measurements]]),
             segment_motions=tuple(
                 self.segment_motions[index] for index in np.flatnonzero(has_enough_measurements)
             ),
@@ -208,7 +208,7 @@ class PositionsAndImuMotion:
             dp[interval_rows] = np.diff(position) - velocity[..., :-1] * np.diff(measurement_time_s)
         return PositionsAndIncrements(
             measurement_m=self.measurement_m,
-            segment_starts=self.segment_edges[:-1],
+            segment_start_indices=self.segment_edges[:-1],
             interval_s=interval_s,
             process_noise_per_sigma_a_squared=process_noise_per_sigma_a_squared,
             process_noise_independent_of_sigma_a=np.zeros_like(process_noise_per_sigma_a_squared),
@@ -280,7 +280,7 @@ class PositionsAndImuMotion:
             fits_outliers,
         )
 
-    def search_offset(
+    def search_time_offset(
         self,
         noise_parameters: NoiseParameters,
         sigma_a_factors: Sequence[float] = (1.0,),
@@ -460,7 +460,7 @@ def make_segment_motion(
     # Arrays below have one row for each step. The mean specific force f of a step is rotated by the
     # attitude in the middle of the step
     mean_specific_force_m_s2 = np.diff(specific_force_integral_m_s, axis=0) / INTEGRATION_STEP_S
-    body_to_ned = to_matrix(
+    body_to_ned = to_rotation_matrix(
         multiply(
             attitude_quaternion[:-1], from_rotation_vector(np.diff(gyro_integral_rad, axis=0) / 2.0)
         )

@@ -32,9 +32,9 @@ MAX_LOG_LIKELIHOOD_DROP = float(chdtri(1, 0.05)) / 2.0
 INITIAL_LOG_SIGMA_SEARCH_STEP = 0.05
 # For each tested SIGMA_A, the most likely SIGMA_Z is searched, or vice versa. In this search, ln σ
 # changes at most by this value from the result for the previous tested SIGMA_A (or SIGMA_Z)
-MAX_OTHER_LOG_SIGMA_CHANGE = 1.0
+MAX_OTHER_NOISE_LOG_SIGMA_CHANGE = 1.0
 # Tolerance of ln σ in the search for the most likely SIGMA_Z for a given SIGMA_A, or vice versa
-OTHER_LOG_SIGMA_TOLERANCE = 2e-3
+OTHER_NOISE_LOG_SIGMA_TOLERANCE = 2e-3
 
 
 @dataclass(frozen=True)
@@ -165,41 +165,41 @@ def compute_gains(
     ):
         p00, p01, p11 = propagate_covariance(covariance, dt)  # P = FPFᵀ + Q
         covariance = p00 + q00, p01 + q01, p11 + q11
-        (_, s, k0, k1), (_, _, updated_covariance) = update_step(
+        (_, s, position_gain, velocity_gain), (_, _, updated_covariance) = update_step(
             0.0, 0.0, covariance, 0.0, sigma_z_m * sigma_z_m
         )
         if skips_update:
-            k0 = k1 = 0.0
+            position_gain = velocity_gain = 0.0
         else:
             covariance = updated_covariance
-        variance_and_gains_by_measurement.append((s, k0, k1))
+        variance_and_gains_by_measurement.append((s, position_gain, velocity_gain))
     return np.array(variance_and_gains_by_measurement).T
 
 
 def compute_innovations_with_gains(
-    preintegrated_motion: PreintegratedMotion, k0: Array, k1: Array
+    preintegrated_motion: PreintegratedMotion, position_gain: Array, velocity_gain: Array
 ) -> Array:
     """Run KF with given position and velocity gains; return the innovation ν (m)."""
     # The predicted states (p, v) solve linear equations, so LAPACK computes all of them at once:
     # p_i - (1 - k0 - dt k1) p_(i-1) - dt v_(i-1) = Δp + (k0 + dt k1) z_(i-1)
     # v_i + k1 p_(i-1) - v_(i-1) = Δv + k1 z_(i-1)
     dt = preintegrated_motion.interval_s[1:]
-    position_gain = k0[:-1] + dt * k1[:-1]
+    predicted_position_gain = position_gain[:-1] + dt * velocity_gain[:-1]
     measured_m = np.ascontiguousarray(preintegrated_motion.measurement_m.T)
     right_hand_side = np.empty((*measured_m.shape, 2))
     right_hand_side[..., 0] = preintegrated_motion.delta_position_m.T
     right_hand_side[..., 1] = preintegrated_motion.delta_velocity_m_s.T
-    right_hand_side[..., 1:, 0] += position_gain * measured_m[..., :-1]
-    right_hand_side[..., 1:, 1] += k1[:-1] * measured_m[..., :-1]
+    right_hand_side[..., 1:, 0] += predicted_position_gain * measured_m[..., :-1]
+    right_hand_side[..., 1:, 1] += velocity_gain[:-1] * measured_m[..., :-1]
     # Coefficients below the unit diagonal: unknown (p or v of each measurement), then distance
-    bands = np.zeros((len(k0), 2, 4))
+    bands = np.zeros((len(position_gain), 2, 4))
     bands[:-1, 1, 1] = -dt
-    bands[:-1, 0, 2] = position_gain - 1.0
+    bands[:-1, 0, 2] = predicted_position_gain - 1.0
     bands[:-1, 1, 2] = -1.0
-    bands[:-1, 0, 3] = k1[:-1]
+    bands[:-1, 0, 3] = velocity_gain[:-1]
     state, _ = lapack.dtbtrs(
         bands.reshape(-1, 4).T,
-        right_hand_side.reshape(-1, 2 * len(k0)).T,
+        right_hand_side.reshape(-1, 2 * len(position_gain)).T,
         uplo="L",
         diag="U",
         overwrite_b=1,
@@ -281,10 +281,10 @@ def find_profile_likelihood_interval(
                     best_log_sigmas[0] + direction * log_sigma_change, tested_other_log_sigma
                 ),
                 bounds=(
-                    other_log_sigma - MAX_OTHER_LOG_SIGMA_CHANGE,
-                    other_log_sigma + MAX_OTHER_LOG_SIGMA_CHANGE,
+                    other_log_sigma - MAX_OTHER_NOISE_LOG_SIGMA_CHANGE,
+                    other_log_sigma + MAX_OTHER_NOISE_LOG_SIGMA_CHANGE,
                 ),
-                options={"xatol": OTHER_LOG_SIGMA_TOLERANCE},
+                options={"xatol": OTHER_NOISE_LOG_SIGMA_TOLERANCE},
             )
             other_log_sigma = float(best_other_sigma_fit.x)
             return float(

@@ -53,7 +53,7 @@ class PositionsAndIncrements:
     ----------
     measurement_m : ndarray, shape (m, a)
         Measured positions; NaN if an axis has none.
-    segment_starts : ndarray of int, shape (s,)
+    segment_start_indices : ndarray of int, shape (s,)
         Index of the first measurement of each segment.
     interval_s : ndarray, shape (m - 1,)
         Intervals between measurements.
@@ -73,7 +73,7 @@ class PositionsAndIncrements:
     """
 
     measurement_m: Array
-    segment_starts: IntArray
+    segment_start_indices: IntArray
     interval_s: Array
     process_noise_per_sigma_a_squared: Array
     process_noise_independent_of_sigma_a: Array
@@ -86,7 +86,7 @@ class PositionsAndIncrements:
     @cached_property
     def is_within_segment(self) -> BoolArray:
         """True for each interval whose two measurements are in the same segment, shape (m - 1,)."""
-        return ~np.isin(np.arange(1, len(self.measurement_m)), self.segment_starts)
+        return ~np.isin(np.arange(1, len(self.measurement_m)), self.segment_start_indices)
 
     def first(self, count: int) -> PositionsAndIncrements:
         """Keep the first ``count`` measurements only."""
@@ -94,7 +94,7 @@ class PositionsAndIncrements:
         return replace(
             self,
             measurement_m=self.measurement_m[:count],
-            segment_starts=self.segment_starts[self.segment_starts < count],
+            segment_start_indices=self.segment_start_indices[self.segment_start_indices < count],
             prior_precision=self.prior_precision[:count],
             **{
                 name: getattr(self, name)[interval_rows]
@@ -129,14 +129,16 @@ class PositionsAndIncrements:
             measurement_and_prior_precision = self.prior_precision.copy()
             # A segment with fewer than two measurements does not contribute to the likelihood
             has_too_few_measurements = (
-                np.add.reduceat(is_axis_measured.astype(int), self.segment_starts) < 2
+                np.add.reduceat(is_axis_measured.astype(int), self.segment_start_indices) < 2
             )
             is_used = is_axis_measured & ~np.repeat(
-                has_too_few_measurements, np.diff([*self.segment_starts, len(is_measured)])
+                has_too_few_measurements, np.diff([*self.segment_start_indices, len(is_measured)])
             )
             measurement_and_prior_precision[:, 0] += np.where(is_used, 1.0 / variance_m2, 0.0)
             # Any precision of its initial state makes its equations regular, without other effect
-            measurement_and_prior_precision[self.segment_starts[has_too_few_measurements]] += 1.0
+            measurement_and_prior_precision[
+                self.segment_start_indices[has_too_few_measurements]
+            ] += 1.0
             # A measured state, or an initial state with a strong prior, adds a degree of freedom.
             # Two of them per segment determine its initial position and velocity
             is_known = (measurement_and_prior_precision > 0.0) & (
@@ -156,7 +158,11 @@ class PositionsAndIncrements:
             system = replace(
                 system, log_determinant=system.log_determinant + float(np.sum(log_precisions))
             )
-            yield axes, system, int(np.count_nonzero(is_known)) - 2 * len(self.segment_starts)
+            yield (
+                axes,
+                system,
+                int(np.count_nonzero(is_known)) - 2 * len(self.segment_start_indices),
+            )
 
 
 @dataclass(frozen=True)
@@ -257,7 +263,7 @@ def fit_positions(
     measured_input_count = measured_m.shape[2]
     dp = positions.delta_position_m
     dv = positions.delta_velocity_m_s
-    segment_edges = np.append(positions.segment_starts, len(positions.measurement_m))
+    segment_edges = np.append(positions.segment_start_indices, len(positions.measurement_m))
     gram_matrix = np.zeros((len(segment_edges) - 1, *dp.shape[1:3], dp.shape[2]))
     log_determinant = 0.0
     degrees_of_freedom = 0
@@ -325,7 +331,7 @@ def subtract_smooth_path(
         )
         # Input 0 is the data, the last input is the scale factor error
         smoothed_state = system.solve(measured_m_by_axis, dp[axes, :, 0], dv[axes, :, 0])
-        smoothed_state[:, :, positions.segment_starts] = 0.0
+        smoothed_state[:, :, positions.segment_start_indices] = 0.0
         path_m = smoothed_state[..., 0]
         path_velocity_m_s = smoothed_state[..., 1]
         measured_m[:, axes] -= path_m[:, 0].T
@@ -361,7 +367,7 @@ def estimate_squared_errors(
     input_weights = np.insert(constant_errors, 0, 1.0, axis=1)
     # An interval is in the segment of the measurement at its end
     input_weights_by_interval = np.repeat(
-        input_weights, np.diff([*positions.segment_starts, len(variance_m2)]), axis=0
+        input_weights, np.diff([*positions.segment_start_indices, len(variance_m2)]), axis=0
     )[1:]
     dp, dv = (
         np.einsum("akn,nk->an", increments[:, 0], input_weights_by_interval)
@@ -417,14 +423,14 @@ def compute_segment_inner_products(
         )
         count = left_factor_positions_m[batch].shape[1]
         left, right, errors = slice(count), slice(count, 2 * count), slice(2 * count, None)
-        left_and_right_positions_m = np.concatenate(
+        left_and_right_factor_positions_m = np.concatenate(
             [left_factor_positions_m[batch], right_factor_positions_m[batch]], axis=1
         )[:, None]
         gram_matrix = fit_positions(
             replace(positions, delta_position_m=dp, delta_velocity_m_s=dv),
             sigma_a_m_s2,
             variance_m2,
-            left_and_right_positions_m,
+            left_and_right_factor_positions_m,
         ).gram_matrix[:, 0]
         information = gram_matrix[:, errors, errors] + np.diag(
             positions.prior_sigmas_of_constant_errors**-2.0
@@ -518,9 +524,9 @@ class BandedNormalEquations:
         right_hand_side[..., :-1, 1] -= self.interval_s * weighted_dp + weighted_dv
         # Only the first inputs have positions. A position measures position + time-correlated noise
         weighted_measurements = self.precision[:, 0] * measured_m
-        right_hand_side_of_measured_inputs = right_hand_side[..., : measured_m.shape[-2], :, :]
-        right_hand_side_of_measured_inputs[..., 0] += weighted_measurements
-        right_hand_side_of_measured_inputs[..., 2:] += weighted_measurements[..., None]
+        right_hand_side_with_measurements = right_hand_side[..., : measured_m.shape[-2], :, :]
+        right_hand_side_with_measurements[..., 0] += weighted_measurements
+        right_hand_side_with_measurements[..., 2:] += weighted_measurements[..., None]
         return right_hand_side.reshape(-1, self.state_count * len(self.precision))
 
     def position_variance(self) -> Array:

@@ -12,7 +12,7 @@ from px4fuse.filter.signals import Axis, compute_mean_step_acceleration
 from px4fuse.flight.model import Unavailable
 
 # Timestamps with a smaller difference (s) are equal: half of PX4's resolution of 1 µs
-MAX_EQUAL_TIME_DIFFERENCE_S = 5e-7
+MAX_DIFFERENCE_OF_EQUAL_TIMES_S = 5e-7
 
 
 @dataclass(frozen=True)
@@ -62,21 +62,21 @@ def make_prediction_steps(axis: Axis, settings: Settings) -> PredictionSteps:
         than the first one.
     """
     start_s = axis.measurement_time_s[0]
-    is_usable = axis.measurement_time_s > start_s + MAX_EQUAL_TIME_DIFFERENCE_S
+    is_usable = axis.measurement_time_s > start_s + MAX_DIFFERENCE_OF_EQUAL_TIMES_S
     measurement_time_s = axis.measurement_time_s[is_usable]
     if not len(measurement_time_s):
         raise SettingsError(
             f"Axis {axis.name} has no position after the initial time of KF, {start_s:.2f} s."
         )
     # A step ends at each multiple of DT and at each measurement
-    grid_count = int(np.floor((measurement_time_s[-1] - start_s) / settings.dt_s + 1e-9)) + 1
-    grid_s = start_s + settings.dt_s * np.arange(grid_count)
+    grid_point_count = int(np.floor((measurement_time_s[-1] - start_s) / settings.dt_s + 1e-9)) + 1
+    grid_s = start_s + settings.dt_s * np.arange(grid_point_count)
     # Multiples of DT that equal a measurement time are omitted, so that no step has zero length
     next_index = np.searchsorted(measurement_time_s, grid_s)
     neighbour_indices = np.clip([next_index - 1, next_index], 0, len(measurement_time_s) - 1)
     time_to_measurement_s = np.abs(measurement_time_s[neighbour_indices] - grid_s).min(axis=0)
     time_s = np.union1d(
-        grid_s[time_to_measurement_s > MAX_EQUAL_TIME_DIFFERENCE_S], measurement_time_s
+        grid_s[time_to_measurement_s > MAX_DIFFERENCE_OF_EQUAL_TIMES_S], measurement_time_s
     )
     measurement_index = np.full(len(time_s), -1, dtype=np.intp)
     measurement_index[np.searchsorted(time_s, measurement_time_s)] = np.flatnonzero(is_usable)

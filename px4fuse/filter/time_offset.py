@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array
-from px4fuse.core.record import NOT_IN_JSON, Count, NotInJson, NotNegative, Record, Share, Span
+from px4fuse.core.record import NOT_IN_JSON, Count, NonNegativeFloat, NotInJson, Record, Share, Span
 from px4fuse.filter.fitting import NoiseParameters, add_noises
 from px4fuse.filter.imu_motion import (
     COARSE_SEARCH_MEASUREMENT_COUNT,
@@ -53,7 +53,7 @@ LIKELIHOOD_CURVE_POINT_COUNT = 121
 # Prior σ (rad) of EKF2's heading with GNSS: a wrong GNSS delay (0.2 s) causes an error of 5°
 GNSS_HEADING_SIGMA_RAD = 0.2
 # Tested differences (s): time offset of one part of the flight minus that of the whole flight
-PART_OFFSET_CHANGES_S = np.concatenate(
+FLIGHT_PART_OFFSET_DIFFERENCES_S = np.concatenate(
     [np.linspace(-0.6, -0.3, 4), np.linspace(-0.2, 0.2, 9), np.linspace(0.3, 0.6, 4)]
 )
 # Maximum half-width (s) of the 95 % interval of an accepted time offset
@@ -75,13 +75,13 @@ MIN_TIME_OFFSET_S = 0.03
 SIMULATED_SEGMENT_GROUP_COUNT, FLIGHT_SEGMENTS_PER_SIMULATED_GROUP = 96, 12
 
 
-class PartOffset(Record):
+class FlightPartTimeOffset(Record):
     """Time offset in one part of the flight."""
 
     start_s: float
     end_s: float
     offset_s: float
-    sigma_s: NotNegative
+    sigma_s: NonNegativeFloat
 
 
 class SourceTimeOffset(Record, kw_only=True):
@@ -109,14 +109,14 @@ class SourceTimeOffset(Record, kw_only=True):
 
     offset_s: float
     interval_s: Span
-    sigma_s: NotNegative
+    sigma_s: NonNegativeFloat
     applied_s: float
     is_determinable: bool
     reason: str = ""
     drift_ppm: float | None = None
-    drift_sigma_ppm: NotNegative | None = None
+    drift_sigma_ppm: NonNegativeFloat | None = None
     change_p_value: Share | None = None
-    parts: tuple[PartOffset, ...]
+    parts: tuple[FlightPartTimeOffset, ...]
     count: Count
     likelihood_curve_offsets_s: NotInJson[Array] = NOT_IN_JSON
     curve_log_likelihood_drops: NotInJson[Array] = NOT_IN_JSON
@@ -192,7 +192,7 @@ def estimate_time_offset(
         return imu_motion
     progress("time offset")
     downsampled_motion = imu_motion.downsample(COARSE_SEARCH_MEASUREMENT_COUNT)
-    offset_s, _ = imu_motion.search_offset(noise_parameters)
+    offset_s, _ = imu_motion.search_time_offset(noise_parameters)
     search_half_width_s = INITIAL_SEARCH_HALF_WIDTH_S
     for motion in (downsampled_motion, imu_motion):
         noise_parameters = motion.fit_noises(offset_s, noise_parameters).noise_parameters
@@ -230,7 +230,7 @@ def estimate_time_offset(
             "positions are noisy"
         )
     applied_offset_s = settings.clock_offset_s
-    parts: tuple[PartOffset, ...] = ()
+    parts: tuple[FlightPartTimeOffset, ...] = ()
     change_p_value = None
     if not rejection_reason:
         progress("change of the position source's time offset during the flight")
@@ -404,13 +404,13 @@ def _estimate_flight_part_offsets(
     noise_parameters: NoiseParameters,
     offset_variance_factor: float,
     applied_offset_s: float,
-) -> tuple[tuple[PartOffset, ...], float | None]:
+) -> tuple[tuple[FlightPartTimeOffset, ...], float | None]:
     """Estimate the time offset of each flight segment, and test for a constant offset.
 
     ``applied_offset_s`` (s) is added to each offset. Return also the p-value of the test; None with
     fewer than two offsets.
     """
-    coarse_offsets_s = offset_s + PART_OFFSET_CHANGES_S
+    coarse_offsets_s = offset_s + FLIGHT_PART_OFFSET_DIFFERENCES_S
     coarse_offsets_s = coarse_offsets_s[np.abs(coarse_offsets_s) <= MAX_TESTED_TIME_OFFSET_S]
     segment_scores_at_coarse_offsets = imu_motion.fit_at_offsets(
         coarse_offsets_s, noise_parameters
@@ -420,7 +420,7 @@ def _estimate_flight_part_offsets(
     )
     spline = CubicSpline(coarse_offsets_s, segment_scores_at_coarse_offsets, axis=1)
     part_offsets = []
-    scores_above_minimum = []
+    score_excesses = []
     for (begin, end), scores in zip(
         pairwise(imu_motion.segment_edges), spline(grid_offsets_s), strict=True
     ):
@@ -429,18 +429,20 @@ def _estimate_flight_part_offsets(
         if sigma_s < MAX_SEGMENT_OFFSET_SIGMA_S:
             start_s, end_s = imu_motion.time_s[[begin, end - 1]].tolist()
             part_offsets.append(
-                PartOffset(start_s, end_s, applied_offset_s + part_offset_s, sigma_s)
+                FlightPartTimeOffset(start_s, end_s, applied_offset_s + part_offset_s, sigma_s)
             )
-            scores_above_minimum.append(scores - scores.min())
+            score_excesses.append(scores - scores.min())
     if len(part_offsets) < 2:
         return tuple(part_offsets), None
     # Log-likelihood ratio: one common time offset against separate time offsets. The terms are in
     # nats without the effect of IMU noise
-    chi_square = 2.0 * float(np.sum(scores_above_minimum, axis=0).min()) / offset_variance_factor
+    chi_square = 2.0 * float(np.sum(score_excesses, axis=0).min()) / offset_variance_factor
     return tuple(part_offsets), float(chdtrc(len(part_offsets) - 1, chi_square))
 
 
-def _fit_clock_drift(part_offsets: tuple[PartOffset, ...]) -> tuple[float | None, float | None]:
+def _fit_clock_drift(
+    part_offsets: tuple[FlightPartTimeOffset, ...],
+) -> tuple[float | None, float | None]:
     """Return clock drift and its σ (ppm) of the source; None with fewer than three flight parts."""
     if len(part_offsets) < 3:
         return None, None

@@ -14,7 +14,14 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from px4fuse.core.arrays import Array, BoolArray
-from px4fuse.core.record import NOT_IN_JSON, Count, NotInJson, NotNegative, OrUnavailable, Record
+from px4fuse.core.record import (
+    NOT_IN_JSON,
+    Count,
+    NonNegativeFloat,
+    NotInJson,
+    OrUnavailable,
+    Record,
+)
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.fitting import (
     SIGMA_A_SEARCH_RANGE_M_S2,
@@ -37,7 +44,7 @@ from px4fuse.filter.signals import Axis, make_downsampling_slice, report_too_few
 from px4fuse.flight.model import Flight, Unavailable
 
 HORIZONTAL = "horizontal"
-NoiseInterval = tuple[NotNegative, NotNegative | None]
+NoiseInterval = tuple[NonNegativeFloat, NonNegativeFloat | None]
 MIN_MEASUREMENTS = 30
 MAX_OUTLIER_FRACTION = 0.3
 # Initial values in the search for the acceleration noise: KF's SIGMA_A multiplied by these factors
@@ -45,7 +52,7 @@ START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 # Initial value (m/√s) of the random walk of a source that may drift
 START_RANDOM_WALK_M = 0.02
 # Change of ln SIGMA_A between the first two values in the search for KF's SIGMA_A
-SIGMA_A_BRACKET_WIDTH = 0.1
+LOG_SIGMA_A_BRACKET_WIDTH = 0.1
 # Estimates within this factor of an end of the search range are reported as bounds only
 SEARCH_RANGE_END_TOLERANCE_FACTOR = 1.001
 
@@ -91,8 +98,8 @@ class HeldOutCheck(Record):
         Log-likelihood gain (nats) over KF's current settings in the second half.
     """
 
-    sigma_a_m_s2: NotNegative
-    sigma_z_m: NotNegative
+    sigma_a_m_s2: NonNegativeFloat
+    sigma_z_m: NonNegativeFloat
     count: Count
     log_likelihood_gain_per_measurement: float
 
@@ -118,11 +125,11 @@ class AxisTuning(Record, kw_only=True):
         Maximum-likelihood noises, including the random walk of the source.
     """
 
-    sigma_a_m_s2: NotNegative | None = None
+    sigma_a_m_s2: NonNegativeFloat | None = None
     sigma_a_m_s2_interval: NoiseInterval | None = None
-    sigma_a_two_state_m_s2: NotNegative | None = None
+    sigma_a_two_state_m_s2: NonNegativeFloat | None = None
     sigma_a_two_state_m_s2_interval: NoiseInterval | None = None
-    sigma_z_m: NotNegative | None = None
+    sigma_z_m: NonNegativeFloat | None = None
     sigma_z_m_interval: NoiseInterval | None = None
     log_likelihood_gain_per_measurement: float
     before: OrUnavailable[Consistency]
@@ -310,7 +317,7 @@ def _fit_with_imu_motion(
         kf_fit.noise_parameters, random_walk_m=START_RANDOM_WALK_M if may_drift else 0.0
     )
     # An approximate time offset is sufficient: it hardly changes the noises
-    offset_s, start_parameters = imu_motion.search_offset(
+    offset_s, start_parameters = imu_motion.search_time_offset(
         start_parameters, START_SIGMA_A_FACTORS, estimates_scale=False
     )
     return imu_motion.fit_noises(offset_s, start_parameters, fits_outliers=True)
@@ -346,7 +353,7 @@ def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z_m: float) -> NoiseEstimate:
         return fit.score(NoiseParameters(sigma_a_m_s2, sigma_z_m))
 
     start = float(np.log(fit.noise_parameters.sigma_a_m_s2))
-    bracket = (start - SIGMA_A_BRACKET_WIDTH, start)
+    bracket = (start - LOG_SIGMA_A_BRACKET_WIDTH, start)
     best_log_sigma_a = float(minimize_scalar(score, bracket, options={"xtol": 1e-4}).x)
     return _make_noise_estimate(score, (best_log_sigma_a, 0.0), SIGMA_A_SEARCH_RANGE_M_S2)
 
@@ -410,10 +417,10 @@ def _test_noises_on_second_half(
         fit.score(noise_parameters) - first_half_fit.score(noise_parameters)
         for noise_parameters in (current_parameters, first_half_parameters)
     )
-    second_half_count = len(fit.measurement_weights) - first_half_count
+    second_half_measurement_count = len(fit.measurement_weights) - first_half_count
     return HeldOutCheck(
         first_half_parameters.sigma_a_m_s2,
         first_half_parameters.sigma_z_m,
-        second_half_count,
-        (current_score - first_half_noise_score) / second_half_count,
+        second_half_measurement_count,
+        (current_score - first_half_noise_score) / second_half_measurement_count,
     )

@@ -49,9 +49,9 @@ from px4fuse.flight.model import (
 )
 
 # Severity "error" if EKF2 fuses the positions for less than this fraction of the time
-FUSED_FRACTION_FOR_ERROR = 0.5
+MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR = 0.5
 # Warning if EKF2 fuses the positions for less than this fraction of the time
-FUSED_FRACTION_FOR_WARNING = 0.98
+MAX_FUSED_FRACTION_FOR_WARNING = 0.98
 # Minimum mean position interval (s) that may delay the start of fusion: with jitter, some intervals
 # exceed EKF2's limit of 0.2 s
 MIN_INTERVAL_FOR_LATE_START_S = 0.18
@@ -110,9 +110,9 @@ def detect_unfused_positions(analysis: PreparedComparison) -> Findings:
         return
     fusion_flag = ekf2.fusion_flags["horizontal"]
     fused_fraction = compute_flag_fraction(fusion_flag, analysis.segment)
-    if fused_fraction >= FUSED_FRACTION_FOR_ERROR:
+    if fused_fraction >= MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR:
         yield from _detect_slow_restart(analysis, fusion_flag)
-    if source is None or fused_fraction >= FUSED_FRACTION_FOR_WARNING:
+    if source is None or fused_fraction >= MAX_FUSED_FRACTION_FOR_WARNING:
         return
     title = f"EKF2 never fused the {source.positions_text}"
     if fused_fraction:
@@ -148,7 +148,7 @@ def detect_unfused_positions(analysis: PreparedComparison) -> Findings:
     if unmet_condition.fault:
         title += f": {unmet_condition.fault}"
     message = f"{title}. {unmet_condition.reason}"
-    if fused_fraction >= FUSED_FRACTION_FOR_ERROR:
+    if fused_fraction >= MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR:
         message += (
             f" For up to {longest_span_s[1] - longest_span_s[0]:.1f} s EKF2 relied on the IMU and "
             "other aiding sources."
@@ -182,7 +182,7 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
     if is_valid is None or is_valid.empty:
         return
     invalid_fraction = 1.0 - compute_flag_fraction(is_valid, analysis.segment)
-    if invalid_fraction <= 1.0 - FUSED_FRACTION_FOR_WARNING:
+    if invalid_fraction <= 1.0 - MAX_FUSED_FRACTION_FOR_WARNING:
         return
     spans = find_spans_with_value(0.0, is_valid, analysis.segment)
     distance_m = _find_largest_distance_m(analysis, ekf2, spans)
@@ -195,7 +195,7 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
             f" The invalid position is up to {format_metres(distance_m)} m from the {reference}."
         )
     yield finding(
-        error_if(invalid_fraction > 1.0 - FUSED_FRACTION_FOR_ERROR),
+        error_if(invalid_fraction > 1.0 - MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR),
         "ekf2_position_invalid",
         f"EKF2's horizontal position is invalid {format_percent(invalid_fraction)} of the time "
         f"(xy_valid 0), and PX4 does not use this position.{distance_sentence}",

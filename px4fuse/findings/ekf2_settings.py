@@ -37,18 +37,18 @@ from px4fuse.findings.model import (
     make_warning,
     make_zero_length_spans,
 )
-from px4fuse.flight.ekf2_parameters import AID_MASK_PARAMETER, PARAMETERS
+from px4fuse.flight.ekf2_parameters import AID_MASK_PARAMETER, MODEL_PARAMETERS
 from px4fuse.flight.model import Ekf2, Unavailable
 
 # Severity "error" if EKF2's noise parameter is at least this factor too small or too large
-MIN_NOISE_FACTOR_FOR_ERROR = 2.0
+MIN_NOISE_FACTOR_FOR_SEVERITY_ERROR = 2.0
 # Minimum fraction of rejected positions that the finding on a too small noise of EKF2 states
 MIN_REJECTED_FRACTION_IN_MESSAGE = 0.05
 # Minimum fraction of rejected positions for a warning: with a gate of 5 √S, a consistent filter
 # rejects a fraction of 6e-7
 REJECTED_FRACTION_FOR_WARNING = 0.01
 # Minimum fraction of rejected positions for severity "error"
-REJECTED_FRACTION_FOR_ERROR = 0.20
+MIN_REJECTED_FRACTION_FOR_SEVERITY_ERROR = 0.20
 # A re-run with a changed setting prevents rejections if it reduces the rejected fraction to less
 # than this multiple of the fraction without the change
 MAX_REJECTED_AFTER_TO_BEFORE_RATIO = 0.5
@@ -108,7 +108,7 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
         )
         action += f" Or let the position source report a variance of {estimated_noise_m**2:.2g} m²."
     yield finding(
-        error_if(factor >= MIN_NOISE_FACTOR_FOR_ERROR),
+        error_if(factor >= MIN_NOISE_FACTOR_FOR_SEVERITY_ERROR),
         f"ekf2_noise_too_{size_word}",
         message,
         action + make_height_noise_advice(analysis, analysis.tuning, estimated_noise_m),
@@ -166,7 +166,7 @@ def _find_rejections(analysis: Analysis, gate: float) -> Findings:
         if rejected_fraction >= REJECTED_FRACTION_FOR_WARNING:
             quantity = "heights" if result is down_comparison else "positions"
             yield finding(
-                error_if(rejected_fraction >= REJECTED_FRACTION_FOR_ERROR),
+                error_if(rejected_fraction >= MIN_REJECTED_FRACTION_FOR_SEVERITY_ERROR),
                 "ekf2_rejects_positions",
                 f"EKF2 rejects {format_percent(rejected_fraction)} of the {quantity}. The "
                 f"rejected innovations are outside EKF2's gate of {gate:g} √S.",
@@ -213,7 +213,7 @@ def detect_parameter_changes(analysis: Analysis) -> Findings:
     changes = [
         change
         for change in ekf2.parameter_changes
-        if change.name in (*PARAMETERS, *fusion_parameters)
+        if change.name in (*MODEL_PARAMETERS, *fusion_parameters)
         and segment.start_s < change.time_s < segment.end_s
     ]
     edges_s = [segment.start_s, *(change.time_s for change in changes), segment.end_s]
@@ -231,7 +231,7 @@ def detect_parameter_changes(analysis: Analysis) -> Findings:
             has_effect, unit_text = True, ""
             action = f"Do not change {name} in flight. {action}"
         else:
-            unit = PARAMETERS[name].printed_unit
+            unit = MODEL_PARAMETERS[name].printed_unit
             has_effect, unit_text = False, f" {unit}" if unit else ""
         effect_sentences = ""
         if not isinstance(nis_before, Unavailable) and not isinstance(nis_after, Unavailable):

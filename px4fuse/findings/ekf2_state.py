@@ -52,9 +52,9 @@ REST_WINDOW_S = 1.0
 # Time (s) before take-off in which the motors run
 MOTOR_RUN_UP_DURATION_S = 0.5
 # Maximum standard deviation of angular rate (rad/s) and specific force (m/s²) at rest
-MAX_RATE_STD_AT_REST, MAX_FORCE_STD_AT_REST = 0.04, 1.5
+MAX_ANGULAR_RATE_STD_AT_REST_RAD_S, MAX_SPECIFIC_FORCE_STD_AT_REST_M_S2 = 0.04, 1.5
 # Maximum change (rad/s) of the mean angular rate between windows at rest
-MAX_RATE_CHANGE_AT_REST_RAD_S = 0.01
+MAX_ANGULAR_RATE_CHANGE_AT_REST_RAD_S = 0.01
 # Minimum gyroscope bias (rad/s) for a finding: the heading turns by 90° in 30 s
 MIN_GYRO_BIAS_RAD_S = 0.05
 # Minimum |specific force at rest - gravity| (m/s²): above it, the finding on a bias at its limit
@@ -96,11 +96,15 @@ def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
     imu = rows_between(flight.imu, -np.inf, end_s).astype(np.float64)
     windows = imu.groupby(np.floor(imu.index / REST_WINDOW_S))
     stds = windows.std()
-    is_rate_constant = np.linalg.norm(stds[Columns.ANGULAR_RATE], axis=1) < MAX_RATE_STD_AT_REST
-    is_force_constant = np.linalg.norm(stds[Columns.SPECIFIC_FORCE], axis=1) < MAX_FORCE_STD_AT_REST
+    is_rate_constant = (
+        np.linalg.norm(stds[Columns.ANGULAR_RATE], axis=1) < MAX_ANGULAR_RATE_STD_AT_REST_RAD_S
+    )
+    is_force_constant = (
+        np.linalg.norm(stds[Columns.SPECIFIC_FORCE], axis=1) < MAX_SPECIFIC_FORCE_STD_AT_REST_M_S2
+    )
     means: pd.DataFrame = windows.mean()[is_rate_constant & is_force_constant]
     rates_rad_s = means[Columns.ANGULAR_RATE]
-    if means.empty or np.ptp(rates_rad_s, axis=0).max() > MAX_RATE_CHANGE_AT_REST_RAD_S:
+    if means.empty or np.ptp(rates_rad_s, axis=0).max() > MAX_ANGULAR_RATE_CHANGE_AT_REST_RAD_S:
         return None
     return means.median()
 

@@ -19,7 +19,7 @@ from px4fuse.comparison.model import (
 )
 from px4fuse.comparison.rerun_effects import Rerun, find_cause_rerun
 from px4fuse.comparison.reruns import ErrorAboveSigma, find_error_above_sigma
-from px4fuse.core.text import capitalise_first, format_metres, format_ratio
+from px4fuse.core.text import capitalise_first_letter, format_metres, format_ratio
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
@@ -39,13 +39,13 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.alignment import fit_alignment
 
 # Minimum mean NEES, for severity "error": an RMS position error of 4 times the reported σ
-MIN_NEES_FOR_ERROR = 16.0
+MIN_NEES_FOR_SEVERITY_ERROR = 16.0
 # If KF's position RMSE ÷ EKF2's position RMSE is below this ratio, the fault is in EKF2 and not in
 # the positions, which both filters use
 MAX_KF_TO_EKF2_RMSE_RATIO = 0.7
 # The position frame is misaligned if alignment (shift and rotation) reduces the position RMSE to
 # less than this fraction
-MAX_ALIGNED_RMSE_RATIO = 0.5
+MAX_ALIGNED_TO_UNALIGNED_RMSE_RATIO = 0.5
 DRIFT_REMEDY = "In the next flight, send an absolute position (GNSS, UWB) as well."
 LOOP_REMEDY = "To correct the path of this flight by a loop closure, run px4fuse loop LOG."
 FRAME_REMEDY = "Rotate and shift the positions into the frame of the ground truth."
@@ -136,7 +136,7 @@ def make_hidden_error_finding(
             "position_rmse_horizontal_m": before_m,
             "position_rmse_aligned_m": after_m,
         }
-        is_misaligned = after_m < MAX_ALIGNED_RMSE_RATIO * before_m
+        is_misaligned = after_m < MAX_ALIGNED_TO_UNALIGNED_RMSE_RATIO * before_m
     kf_errors = analysis.axes[worst_axis].filters["kf"].truth
     if cause is not None:
         remedy = format_action(analysis, cause.change)
@@ -160,7 +160,7 @@ def make_hidden_error_finding(
             )
         remedy += f" {find_source_texts(analysis).slow_error_check}."
     return finding(
-        error_if(worst_error.nees >= MIN_NEES_FOR_ERROR),
+        error_if(worst_error.nees >= MIN_NEES_FOR_SEVERITY_ERROR),
         "error_exceeds_reported_sigma",
         f"Position errors that innovations do not show: {', '.join(ratio_texts.values())}. "
         f"{' '.join(sentences)}",
@@ -189,7 +189,7 @@ def _make_drift_finding(
     ):
         length_m = loop.path_length_m
         evidence = {**evidence, "closure_error_m": closure_error_m, "path_length_m": length_m}
-        rmse_sentence = f"{capitalise_first(rmse_text)}. "
+        rmse_sentence = f"{capitalise_first_letter(rmse_text)}. "
         drift_text = (
             f"loop closure error {format_metres(closure_error_m)} m, "
             f"{format_percent(closure_error_m / length_m, 1)} of a path of {length_m:.0f} m"

@@ -9,7 +9,7 @@ from px4fuse.core.arrays import select_intervals
 from px4fuse.core.record import Span
 from px4fuse.ekf2.inputs import MAX_MISSING_IMU_FRACTION, compute_lost_imu_fraction
 from px4fuse.filter.hypotheses import (
-    MIN_BIAS_M_S2,
+    MIN_REPORTED_ACCELEROMETER_BIAS_M_S2,
     SystematicErrors,
     estimate_mean_acceleration_error,
 )
@@ -24,7 +24,7 @@ from px4fuse.findings.model import (
     make_warning,
 )
 from px4fuse.findings.recording import DEFAULT_SDLOG_PROFILE, VISION_PROFILE_MASK
-from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, sample_rate
+from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, compute_sample_rate_hz
 
 # Maximum specific force (m/s²) of real sensors: 35 g, because the largest range is 32 g
 MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2 = 343.0
@@ -70,15 +70,16 @@ def detect_impossible_acceleration(analysis: Analysis) -> Findings:
     times_s = samples.index[force_m_s2 > MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2].tolist()
     if len(times_s) < MIN_IMPLAUSIBLE_FORCE_SAMPLES:
         return
-    max_force_m_s2, start_s = float(np.nanmax(force_m_s2)), times_s[0]
+    max_specific_force_m_s2, start_s = float(np.nanmax(force_m_s2)), times_s[0]
     yield make_error(
         "imu_values_impossible",
-        f"The accelerometer values are impossible: up to {max_force_m_s2:,.0f} m/s², first at "
+        f"The accelerometer values are impossible: up to {max_specific_force_m_s2:,.0f} m/s², "
+        "first at "
         f"{start_s:.1f} s. Sensors of autopilots measure at most 32 g (314 m/s²). The simulator "
         "has diverged, or the log is damaged.",
         "Analyse only the time before the impossible values "
         f"(--end {max(start_s - 1.0, 0.0):.1f}).",
-        {"max_m_s2": max_force_m_s2, "count": len(times_s), "at_s": start_s},
+        {"max_m_s2": max_specific_force_m_s2, "count": len(times_s), "at_s": start_s},
         ((start_s, times_s[-1]),),
     )
 
@@ -126,7 +127,7 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
             "the heights of the position source. An accelerometer scale factor of "
             f"{1.0 - error_m_s2 / constants.g:.3f} has the same effect."
         )
-    if bias_m_s2 >= MIN_BIAS_M_S2:
+    if bias_m_s2 >= MIN_REPORTED_ACCELEROMETER_BIAS_M_S2:
         yield finding(
             error_if(bias_m_s2 >= min_severe_bias_m_s2),
             "accelerometer_bias",
@@ -147,7 +148,7 @@ def _find_ekf2_accelerometer_bias(analysis: Analysis) -> list[float] | None:
 
 def detect_tumbling(analysis: Analysis) -> Findings:
     """Detect roll or pitch beyond the limits of PX4's failure detector."""
-    if spans := analysis.segment.cut(analysis.flight.excessive_tilt_spans_s):
+    if spans := analysis.segment.clip_spans(analysis.flight.excessive_tilt_spans_s):
         start_s = spans[0][0]
         yield make_error(
             "attitude_failure",
@@ -166,7 +167,7 @@ def detect_clipping(analysis: Analysis) -> Findings:
         return
     imu_samples = cut_to_segment(imu, analysis.segment)
     time_s = imu_samples.index[imu_samples["clipped"] > 0.0].to_numpy()
-    clipped_duration_s = len(time_s) / sample_rate(imu)
+    clipped_duration_s = len(time_s) / compute_sample_rate_hz(imu)
     if clipped_duration_s > MAX_CLIPPING_DURATION_S:
         bursts_s = np.split(
             time_s, np.flatnonzero(np.diff(time_s) > MIN_TIME_BETWEEN_CLIPPINGS_S) + 1
@@ -186,7 +187,10 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
     gap_s, imu, log = analysis.main.kf_run.input_gap_s, analysis.flight.imu, analysis.flight.log
     interval_s, spans = 0.0, tuple[Span, ...]()
     if not isinstance(imu, Unavailable):
-        interval_s, spans = 1.0 / sample_rate(imu), _find_gap_spans(imu, analysis.segment)
+        interval_s, spans = (
+            1.0 / compute_sample_rate_hz(imu),
+            _find_gap_spans(imu, analysis.segment),
+        )
     if gap_s > max(MIN_REPORTED_IMU_GAP_S, 2.0 * interval_s):
         action = ""
         if log.format.startswith("MAVLink"):
@@ -239,7 +243,7 @@ def _find_gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
 
 
 def is_rate_too_low(samples: pd.DataFrame, required_rate_hz: float) -> bool:
-    return sample_rate(samples) < MIN_MEASURED_TO_REQUIRED_RATE_RATIO * required_rate_hz
+    return compute_sample_rate_hz(samples) < MIN_MEASURED_TO_REQUIRED_RATE_RATIO * required_rate_hz
 
 
 def detect_low_rates(flight: Flight) -> Findings:
@@ -251,7 +255,7 @@ def detect_low_rates(flight: Flight) -> Findings:
     ):
         topic = flight.streams[name].topics[0] if name in flight.streams else default_topic
         if isinstance(samples, pd.DataFrame) and is_rate_too_low(samples, required_rate_hz):
-            rate_hz = sample_rate(samples)
+            rate_hz = compute_sample_rate_hz(samples)
             sdlog_profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_SDLOG_PROFILE))
             action = (
                 f"Set SDLOG_PROFILE to {sdlog_profile | SDLOG_HIGH_RATE_MASK} (bit 4 logs {topic} "

@@ -3,7 +3,7 @@
 from px4fuse.analysis import Analysis
 from px4fuse.finding import Finding
 from px4fuse.findings.model import Findings, make_error, make_note, make_warning
-from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
+from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Loop, LoopClosure
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
 # Maximum fraction of rejected loop closures if the stated odometry drift is correct
@@ -79,7 +79,7 @@ def detect_inconsistent_closures(loop: Loop) -> Findings:
             )
 
 
-def _make_false_closure_finding(closure: Closure, is_end_assumed: bool) -> Finding:
+def _make_false_closure_finding(closure: LoopClosure, is_end_assumed: bool) -> Finding:
     is_landing = closure.source == LANDING_CLOSURE_SOURCE
     closure_text = str(closure)
     if is_landing and is_end_assumed:
@@ -100,5 +100,5 @@ def _make_false_closure_finding(closure: Closure, is_end_assumed: bool) -> Findi
     )
 
 
-def _make_closure_evidence(closure: Closure) -> dict[str, float]:
+def _make_closure_evidence(closure: LoopClosure) -> dict[str, float]:
     return {**{name: getattr(closure, name) for name in CLOSURE_FIELDS}, "alpha": GATE_ALPHA}

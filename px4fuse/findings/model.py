@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.record import Record, Span, read_toml
-from px4fuse.core.text import capitalise_first
+from px4fuse.core.text import capitalise_first_letter
 from px4fuse.filter.signals import Segment
 from px4fuse.finding import SEVERITIES, Finding, Severity
 from px4fuse.flight.ekf2_parameters import MAG, MAG_TYPE_NONE
@@ -109,7 +109,7 @@ class FindingExample(Record):
     detection_rate_by_fault: Mapping[str, float]
 
 
-def load_examples() -> Mapping[str, FindingExample]:
+def load_finding_examples() -> Mapping[str, FindingExample]:
     return msgspec.json.decode(
         Path(__file__).with_name("examples.json").read_bytes(), type=dict[str, FindingExample]
     )
@@ -158,7 +158,7 @@ def finding(
     spans_s: tuple[Span, ...] = (),
 ) -> Finding:
     """Make a finding with the id ``name``; its title is the first sentence of the message."""
-    message = capitalise_first(message)
+    message = capitalise_first_letter(message)
     title = message.partition(". ")[0].removesuffix(".")
     return Finding(name, severity, message, remedy, evidence, title, spans_s=spans_s)
 
@@ -265,7 +265,7 @@ def find_spans_with_value(
     edges_s[0] = -np.inf
     has_value = np.pad(step_function == value, 1)
     change_times_s = edges_s[has_value[1:] != has_value[:-1]].tolist()
-    return segment.cut(zip(change_times_s[::2], change_times_s[1::2], strict=True))
+    return segment.clip_spans(zip(change_times_s[::2], change_times_s[1::2], strict=True))
 
 
 def compute_flag_fraction(step_function: pd.Series, segment: Segment) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z, find_axis_tuning
+from px4fuse.comparison.changes import SIGMA_A_KEY, SIGMA_Z_KEY, find_axis_tuning
 from px4fuse.comparison.estimates import find_first_available_tuning
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
@@ -47,26 +47,26 @@ from px4fuse.findings.model import (
     make_error,
 )
 from px4fuse.findings.source_positions import has_little_motion
-from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, PARAMETERS
-from px4fuse.flight.model import Columns, Unavailable, sample_rate
+from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, MODEL_PARAMETERS
+from px4fuse.flight.model import Columns, Unavailable, compute_sample_rate_hz
 from px4fuse.readers.px4_innovations import has_fused_aid
 from px4fuse.request import COMPARISON_OPTIONS
 
 # Warning if a noise setting is at least this factor too small or too large
-MIN_SETTING_TO_ESTIMATE_FACTOR = 1.5
+MIN_NOISE_SETTING_TO_ESTIMATE_FACTOR = 1.5
 # Severity "error" if a noise setting is at least this factor too small or too large
-MIN_NOISE_FACTOR_FOR_ERROR = 4.0
+MIN_NOISE_FACTOR_FOR_SEVERITY_ERROR = 4.0
 # KF hardly reacts to new positions if its time constant exceeds this value (s)
 MIN_KF_TIME_CONSTANT_S = 2.5
 # Factor that widens the 95 % interval of ln(noise): only 0.3 % of correct noise settings are
 # outside
-INTERVAL_WIDENING_FACTOR = 1.5
+CONFIDENCE_INTERVAL_WIDENING_FACTOR = 1.5
 # KF lags if the lag-1 autocorrelation of its innovations exceeds this value (white noise: at most
 # 0.2)
-MIN_LAG1_AUTOCORRELATION = 0.3
+MIN_INNOVATION_LAG1_AUTOCORRELATION = 0.3
 
 # Severity "error" if the reported σ is at least this factor too small or too large
-MIN_SIGMA_FACTOR_FOR_ERROR = 2.0
+MIN_SIGMA_FACTOR_FOR_SEVERITY_ERROR = 2.0
 # Maximum ratio (larger ÷ smaller) of two noises that count as equal: a σ estimated from the median
 # of 100 values has a standard error of 12 %
 MAX_RATIO_OF_EQUAL_NOISES = 1.25
@@ -116,13 +116,13 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
     axis_tuning = find_first_available_tuning(analysis.tuning, HORIZONTAL, "aisle", "down")
     if axis_tuning is None:
         return
-    noise_estimates = {SIGMA_Z: axis_tuning.sigma_z, SIGMA_A: axis_tuning.sigma_a_two_state}
+    noise_estimates = {SIGMA_Z_KEY: axis_tuning.sigma_z, SIGMA_A_KEY: axis_tuning.sigma_a_two_state}
     if has_little_motion(analysis):  # without motion SIGMA_A cannot be estimated
-        del noise_estimates[SIGMA_A]
+        del noise_estimates[SIGMA_A_KEY]
     may_drift = analysis.source.origin.may_drift
     # Innovations do not show drift and time-correlated errors, so a setting above the estimate may
     # be correct
-    may_be_larger = (
+    may_setting_exceed_estimate = (
         may_drift
         or analysis.source.origin.is_gnss
         or any(filter_name == "kf" for filter_name, *_ in find_hidden_errors(analysis))
@@ -133,7 +133,7 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
         deviation = find_setting_deviation(name, setting, noise)
         if deviation is None:
             continue
-        if may_be_larger and setting >= deviation.estimate:
+        if may_setting_exceed_estimate and setting >= deviation.estimate:
             continue
         if may_drift and deviation.severity == "note":
             continue
@@ -158,7 +158,7 @@ def _make_setting_finding(
     setting, label = getattr(analysis.settings, name), SETTING_RANGES[name].label
     is_too_small = setting < estimated_noise
     # R = SIGMA_Z² decreases KF's gain, Q from SIGMA_A increases the gain
-    is_gain_too_large = is_too_small if name == SIGMA_Z else not is_too_small
+    is_gain_too_large = is_too_small if name == SIGMA_Z_KEY else not is_too_small
     if is_gain_too_large:
         effect, gain_size_word = "KF follows the noise of single positions", "large"
     else:
@@ -203,7 +203,7 @@ def format_setting_action(analysis: Analysis, name: str) -> str:
         return f"To test the default value, run again without {COMPARISON_OPTIONS[name]}."
     # SIGMA_A and SIGMA_Z are estimated together: setting only one of them to its estimate can make
     # a consistent KF inconsistent
-    other_label = "SIGMA_A" if name == SIGMA_Z else "SIGMA_Z"
+    other_label = "SIGMA_A" if name == SIGMA_Z_KEY else "SIGMA_Z"
     return (
         f"Do not change this setting alone: it is estimated together with {other_label}, and no "
         "re-run confirmed the estimate."
@@ -221,13 +221,13 @@ def find_setting_deviation(
         return None
     # Widen the 95 % interval on the logarithmic scale
     low, high = (
-        estimate * (end / estimate) ** INTERVAL_WIDENING_FACTOR
+        estimate * (end / estimate) ** CONFIDENCE_INTERVAL_WIDENING_FACTOR
         for end in (low or 0.0, high or np.inf)
     )
     factor = max(setting / estimate, estimate / setting)
-    if low <= setting <= high or factor < MIN_SETTING_TO_ESTIMATE_FACTOR:
+    if low <= setting <= high or factor < MIN_NOISE_SETTING_TO_ESTIMATE_FACTOR:
         return None
-    severity = error_if(factor >= MIN_NOISE_FACTOR_FOR_ERROR)
+    severity = error_if(factor >= MIN_NOISE_FACTOR_FOR_SEVERITY_ERROR)
     if setting == getattr(Settings(), name):  # px4fuse's default, not chosen by the user
         severity = lower_severity(severity)
     return SettingDeviation(estimate, factor, severity)
@@ -242,11 +242,11 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
         if (
             isinstance(summary, Unavailable)
             or summary.verdict != "overconfident"
-            or summary.lag1_autocorrelation < MIN_LAG1_AUTOCORRELATION
+            or summary.lag1_autocorrelation < MIN_INNOVATION_LAG1_AUTOCORRELATION
         ):
             continue
         gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
-        time_constant_s = 1.0 / (sample_rate(updates) * gain)
+        time_constant_s = 1.0 / (compute_sample_rate_hz(updates) * gain)
         if time_constant_s < MIN_KF_TIME_CONSTANT_S:
             continue
         sigma_a_m_s2 = analysis.settings.sigma_a_m_s2
@@ -255,8 +255,8 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
         action = "Increase SIGMA_A (--sigma-a)."
         if axis_tuning is not None and (estimate := axis_tuning.sigma_a_two_state).value:
             title = f"SIGMA_A is {format_factor(estimate.value / sigma_a_m_s2)} times too small"
-            estimate_text = f"{format_estimate(SIGMA_A, sigma_a_m_s2, estimate)}. "
-            action = format_setting_action(analysis, SIGMA_A)
+            estimate_text = f"{format_estimate(SIGMA_A_KEY, sigma_a_m_s2, estimate)}. "
+            action = format_setting_action(analysis, SIGMA_A_KEY)
         yield make_error(
             "process_noise_near_zero",
             f"{title}: KF ignores new positions. {estimate_text}KF's position gain decreases to "
@@ -293,7 +293,7 @@ def _make_wrong_sigma_finding(
         inconsistent_axes,
         key=lambda axis: (axis[0] is analysis.main, abs(np.log(axis[1].nis_mean))),
     )
-    severity = error_if(summary.sigma_error_factor >= MIN_SIGMA_FACTOR_FOR_ERROR)
+    severity = error_if(summary.sigma_error_factor >= MIN_SIGMA_FACTOR_FOR_SEVERITY_ERROR)
     if _has_default_noises(analysis, filter_name, worst_axis):
         severity = lower_severity(severity)
     cause, remedy_text, is_note = _explain_wrong_sigma(analysis, filter_name, worst_axis, summary)
@@ -382,7 +382,7 @@ def _format_action_for_excessive_noise(analysis: Analysis) -> str:
 def _explain_noise_minimum(analysis: Analysis) -> str:
     """Return the advice to change nothing if PX4 limits the noise from below; else ""."""
     parameters, origin = analysis.flight.log.parameters, analysis.source.origin
-    gnss_noise_m = parameters.get(GNSS_POS.noise, PARAMETERS[GNSS_POS.noise].default)
+    gnss_noise_m = parameters.get(GNSS_POS.noise, MODEL_PARAMETERS[GNSS_POS.noise].default)
     if (
         origin.is_fused_as_gnss
         and (reported_noise_m := _find_reported_noise_m(analysis)) >= gnss_noise_m

@@ -4,7 +4,7 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
-from px4fuse.core.text import capitalise_first, format_number
+from px4fuse.core.text import capitalise_first_letter, format_number
 from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
 from px4fuse.findings.model import Findings, format_count, make_note, make_warning
 from px4fuse.flight.model import AS_RECEIVED_ORIGIN, Ekf2, Flight, Unavailable
@@ -132,7 +132,7 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
 
 
 def _capitalise_note(note: str) -> str:
-    return note if "." in note.split(" ", 1)[0] else capitalise_first(note)
+    return note if "." in note.split(" ", 1)[0] else capitalise_first_letter(note)
 
 
 def detect_unavailable_data(analysis: Analysis) -> Findings:

@@ -15,7 +15,7 @@ from px4fuse.flight.ekf2_parameters import GNSS_POS, RECEIVER_DELAY_PARAMETERS
 from px4fuse.flight.model import Unavailable
 
 # Minimum time offset (s) for severity "error"; it causes a position error of 0.1 m at 1 m/s
-MIN_OFFSET_FOR_ERROR_S = 0.10
+MIN_OFFSET_FOR_SEVERITY_ERROR_S = 0.10
 # Maximum ratio of KF's position RMSE with corrected timestamps to the RMSE without correction
 MAX_RMSE_RATIO_AFTER_CORRECTION = 1.005
 CORRECT_AT_SENDER_ACTION = "Correct the position timestamps before sending."
@@ -70,7 +70,7 @@ def detect_time_offset(analysis: Analysis, time_offset: SourceTimeOffset) -> Fin
     if offset_s < 0.0:
         offset_s, low_s, high_s, late_or_early = -offset_s, -high_s, -low_s, "late"
     yield finding(
-        error_if(offset_s > MIN_OFFSET_FOR_ERROR_S),
+        error_if(offset_s > MIN_OFFSET_FOR_SEVERITY_ERROR_S),
         "source_time_offset",
         f"Position timestamps are {offset_s:.2f} s {late_or_early}. The time offset estimated from "
         f"IMU and positions is {offset_s:.3f} s (95 % {low_s:.3f} to {high_s:.3f} s). At 1 m/s, "
@@ -122,7 +122,7 @@ def _find_offset_remedy(analysis: Analysis, time_offset: SourceTimeOffset) -> st
     if delay_parameter := _find_receiver_delay_parameter(analysis):
         return f"Check the delay of the GNSS receiver ({delay_parameter})."
     if analysis.source.alignment is not None:
-        total_offset_s = compute_offset_for_option_s(analysis, time_offset)
+        total_offset_s = compute_clock_offset_option_s(analysis, time_offset)
         return f"Run again with --clock-offset {total_offset_s:.3f}."
     position_age_ms = (remedy.find_logged_delay_ms(analysis) or 0.0) - 1e3 * time_offset.remaining_s
     action = format_sender_action(analysis.source, time_offset.remaining_s)
@@ -131,7 +131,7 @@ def _find_offset_remedy(analysis: Analysis, time_offset: SourceTimeOffset) -> st
     return f"{action}."
 
 
-def compute_offset_for_option_s(
+def compute_clock_offset_option_s(
     comparison: PreparedComparison, time_offset: SourceTimeOffset
 ) -> float:
     """Return the value (s) of ``--clock-offset`` that corrects a time offset."""

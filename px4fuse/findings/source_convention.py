@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.convention.axes import METRES_PER_UNIT
-from px4fuse.convention.check import check_convention
+from px4fuse.convention.check import determine_source_convention
 from px4fuse.convention.correction import (
     MIN_RESIDUAL_ROTATION_DEG,
     ConventionFaults,
@@ -20,7 +20,7 @@ from px4fuse.convention.texts import (
     FRAME_AXES,
     describe_axes,
     describe_quaternion_conversion,
-    describe_unit,
+    describe_wrong_unit,
     find_axes_in_file,
     format_axes,
     format_delay,
@@ -53,7 +53,7 @@ def detect_wrong_orientation(flight: Flight, source: PositionTrack) -> Findings:
 
     Unlike :func:`detect`, it needs no comparison of KF and EKF2, and does not check positions.
     """
-    convention = check_convention(flight, source)
+    convention = determine_source_convention(flight, source)
     if convention is not None:
         faults = find_convention_faults(convention, flight, source.frame)
         yield from _detect_orientation_faults(convention, faults, source)
@@ -187,7 +187,9 @@ def _detect_position_faults(
             "gyroscopes": "the heading at take-off",
             "GNSS": "the GNSS positions",
         }[convention.heading_from]
-        other_cause = "" if convention.heading_from == "GNSS" else f", or {reference_text} is wrong"
+        other_cause_text = (
+            "" if convention.heading_from == "GNSS" else f", or {reference_text} is wrong"
+        )
         action = (
             "Align the frame of the source with north, or rotate positions and orientation by "
             f"{-rotation_deg:+.0f}° before sending."
@@ -198,12 +200,12 @@ def _detect_position_faults(
             "source_frame_misaligned",
             f"{positions_text} are rotated by {rotation_deg:+.0f}° (clockwise from above) "
             f"relative to {reference_text}. The x axis of the source does not point north"
-            f"{other_cause}. {evidence_sentence} The analysis rotates the positions to NED.",
+            f"{other_cause_text}. {evidence_sentence} The analysis rotates the positions to NED.",
             action,
             _make_evidence(convention, "rotation") | {"misalignment_deg": rotation_deg},
         )
     if faults.has_wrong_unit:
-        fault_text, action = describe_unit(
+        fault_text, action = describe_wrong_unit(
             convention.unit, positions_text, is_file=is_position_file
         )
         distance_ratio = convention.scale / METRES_PER_UNIT[convention.unit]

@@ -9,7 +9,7 @@ from px4fuse.comparison.remedy import find_aid, format_changes
 from px4fuse.core.text import lowercase_first_letter
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding
-from px4fuse.findings.ekf2_fusion import FUSED_FRACTION_FOR_ERROR
+from px4fuse.findings.ekf2_fusion import MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR
 from px4fuse.findings.ekf2_settings import find_confirmed_noise_rerun
 from px4fuse.findings.model import (
     Findings,
@@ -61,7 +61,7 @@ def make_frd_positions_finding(analysis: Analysis) -> Finding:
             note_action += " Give the ULog of this flight, too: it shows EKF2's frame."
             return make_note("source_frame_frd", message, note_action)
         fused_fraction = compute_flag_fraction(ekf2.fusion_flags["yaw"], analysis.segment)
-        if fused_fraction > FUSED_FRACTION_FOR_ERROR:
+        if fused_fraction > MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR:
             message = f"{fault} EKF2 fused the yaw of {sensor_name}, so EKF2's axes are also FRD."
             return make_note("source_frame_frd", message, note_action)
     action = "Send the position in NED."

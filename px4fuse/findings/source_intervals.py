@@ -43,7 +43,7 @@ MIN_FRACTION_OF_TWO_MOST_FREQUENT_INTERVALS = 0.85
 MIN_FRACTION_OF_RARER_INTERVAL_LENGTH = 0.1
 # Maximum RMS deviation of the intervals from multiples of a tested source period, as fraction of
 # the period, to report downsampling. Intervals with jitter have 0.03, random intervals 0.29
-MAX_ROUNDING_RMS_ERROR = 0.06
+MAX_RMS_ROUNDING_ERROR_IN_PERIODS = 0.06
 # px4fuse searches the period of a downsampled source among the median interval ÷ n, n = 1, 2, … to
 # this value
 MAX_SOURCE_PERIODS_PER_MEDIAN_INTERVAL = 4
@@ -317,6 +317,6 @@ def _find_period(intervals_s: Array) -> tuple[float, Array] | None:
             continue
         period_s = float(np.sum(intervals_s) / np.sum(multiples))
         rounding_errors = intervals_s / period_s - multiples
-        if np.mean(rounding_errors**2) ** 0.5 <= MAX_ROUNDING_RMS_ERROR:
+        if np.mean(rounding_errors**2) ** 0.5 <= MAX_RMS_ROUNDING_ERROR_IN_PERIODS:
             return period_s, multiples
     return None

@@ -12,7 +12,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison, select_north_and_east
 from px4fuse.core.arrays import Array, rms
 from px4fuse.core.text import format_factor, format_metres
-from px4fuse.ekf2.fusion_conditions import constant_coordinates, is_height_only
+from px4fuse.ekf2.fusion_conditions import find_constant_coordinates, is_height_only
 from px4fuse.ekf2.replay import compute_rmse_to_truth
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.hypotheses import (
@@ -64,9 +64,9 @@ MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS = 1.0
 # low-pass filter
 MAX_ESTIMATED_LAG_TO_DELAY_RATIO = 4.0
 # Minimum filter lag (s) for a warning; it causes a position error of 5 cm at 1 m/s
-MIN_LAG_S = 0.05
+MIN_FILTER_LAG_S = 0.05
 # Minimum filter lag (s) for severity "error"; it causes a position error of 10 cm at 1 m/s
-MIN_LAG_FOR_ERROR_S = 0.10
+MIN_FILTER_LAG_FOR_SEVERITY_ERROR_S = 0.10
 # Minimum position jump (m) for a warning: twice the noise of a good UWB system (0.1 m)
 MIN_JUMP_M = 0.2
 # Minimum ratio of a position jump to the σ of time-correlated noise, for a warning
@@ -101,7 +101,7 @@ EV_CTRL_HORIZONTAL_MASK, EV_CTRL_HEIGHT_MASK = 1, 2
 # Maximum time (s) between a jump and the increment of reset_counter: two intervals at 2 Hz
 MAX_JUMP_TO_RESET_COUNTER_TIME_S = 1.0
 # Minimum position jump (m) for severity "error": five times the noise of a good UWB system (0.1 m)
-MIN_JUMP_FOR_ERROR_M = 0.5
+MIN_JUMP_FOR_SEVERITY_ERROR_M = 0.5
 # Minimum scale factor error (ratio minus 1) for a warning: flights without a fault reach 0.11
 MIN_SCALE_ERROR_FOR_WARNING = 0.12
 # Minimum scale factor error (ratio minus 1), for severity "error": 1 m in a distance of 7 m
@@ -111,7 +111,7 @@ MIN_SCALE_ERROR_TO_SIGMA_RATIO = 3.0
 # Minimum fraction of outliers for a warning: normal noise has 0.02 % beyond 3.7 σ
 MIN_OUTLIER_FRACTION = 0.005
 # Minimum fraction of outliers, for severity "error": one outlier in 10 s at 5 Hz
-MIN_OUTLIER_FRACTION_FOR_ERROR = 0.02
+MIN_OUTLIER_FRACTION_FOR_SEVERITY_ERROR = 0.02
 # Minimum number of outliers for a finding
 MIN_OUTLIERS = 3
 # Minimum fraction of positions with logged innovations, to state the number of rejected outliers
@@ -145,7 +145,7 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
         or (time_offset := _find_valid_time_offset(analysis)) is None
         or isinstance(low_pass, Unavailable)
         or low_pass.gain_nats < MIN_LOW_PASS_LOG_LIKELIHOOD_RATIO_NATS
-        or low_pass.lag_s < MIN_LAG_S
+        or low_pass.lag_s < MIN_FILTER_LAG_S
     ):
         return None
     correlated_noise = analysis.time_correlated_noise
@@ -158,7 +158,7 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     # At a high position rate, the lag estimated from the correlation of the noise is inaccurate:
     # use the measured delay relative to the IMU
     max_delay_s = -time_offset.interval_s[0]  # late timestamps have a negative offset
-    if low_pass.lag_s > MAX_ESTIMATED_LAG_TO_DELAY_RATIO * max_delay_s >= MIN_LAG_S:
+    if low_pass.lag_s > MAX_ESTIMATED_LAG_TO_DELAY_RATIO * max_delay_s >= MIN_FILTER_LAG_S:
         return replace(low_pass, lag_s=-time_offset.offset_s)
     return low_pass
 
@@ -174,7 +174,7 @@ def detect_low_pass(analysis: Analysis) -> Findings:
     low_pass = find_low_pass(analysis)
     if low_pass is not None:
         yield finding(
-            error_if(low_pass.lag_s >= MIN_LAG_FOR_ERROR_S),
+            error_if(low_pass.lag_s >= MIN_FILTER_LAG_FOR_SEVERITY_ERROR_S),
             "source_low_pass_filtered",
             f"{analysis.source.positions_text} are low-pass filtered and lag by "
             f"{low_pass.lag_s:.2f} s. The correlation of successive errors is "
@@ -215,12 +215,13 @@ def detect_jumps(analysis: Analysis) -> Findings:
     if len(jumps) > 1:
         jump_text = f"jump {len(jumps)} times, by up to {size_m:.2f} m"
     total_step_m = np.sum([[step.value for step in jump.step_m] for jump in jumps], axis=0)
-    returns = np.linalg.norm(total_step_m) < MIN_JUMP_M
+    has_returned_after_jumps = np.linalg.norm(total_step_m) < MIN_JUMP_M
     yield finding(
-        error_if(size_m >= MIN_JUMP_FOR_ERROR_M),
+        error_if(size_m >= MIN_JUMP_FOR_SEVERITY_ERROR_M),
         "source_position_jump",
         f"{analysis.source.positions_text} {jump_text} at {time_s:.1f} s and "
-        f"{'return afterwards' if returns else 'stay there'}. The IMU does not measure this motion "
+        f"{'return afterwards' if has_returned_after_jumps else 'stay there'}. The IMU does not "
+        "measure this motion "
         f"(± {1.96 * sigma_m:.2f} m, 95 %). {cause} KF and EKF2 follow the jump with consistent "
         "innovations.",
         f"{source_texts.jump_action} Analyse only the time before or after the jump (--start, "
@@ -233,13 +234,15 @@ def detect_jumps(analysis: Analysis) -> Findings:
 def detect_constant_coordinates(analysis: Analysis) -> Findings:
     """Detect coordinates that the source does not measure: they are constant in the whole log."""
     source, parameters = analysis.source, analysis.flight.log.parameters
-    coordinates = constant_coordinates(source)
+    coordinates = find_constant_coordinates(source)
     is_single_coordinate = len(coordinates) == 1
     if not (is_single_coordinate or is_height_only(source)) or (
         is_single_coordinate and source.quantisation_step_m > 0.0
     ):
         return  # rounded positions may be constant in motion
-    values_m = dict(zip("xyz", source.samples[Columns.POSITION].median().tolist(), strict=True))
+    median_m_by_coordinate = dict(
+        zip("xyz", source.samples[Columns.POSITION].median().tolist(), strict=True)
+    )
     finding_id, make_finding = "source_coordinate_constant", make_warning
     constant_axes_mask, measured_axes_mask = EV_CTRL_HORIZONTAL_MASK, EV_CTRL_HEIGHT_MASK
     if coordinates == ["z"]:
@@ -260,13 +263,13 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
             if coordinates == ["z"]:  # EKF2 does not fuse the constant height
                 make_finding = make_note
         action += f", so that EKF2 does not fuse {coordinates_text}. "
-    values_text = ", ".join(f"{values_m[each]:g}" for each in coordinates)
+    values_text = ", ".join(f"{median_m_by_coordinate[each]:g}" for each in coordinates)
     yield make_finding(
         finding_id,
         f"The source {source.name} does not measure {coordinates_text} (constant: {values_text} "
         f"m). {consequence}",
         f"{action}Send NaN for a coordinate that is not measured.",
-        {f"{each}_m": value for each, value in values_m.items()},
+        {f"{each}_m": value for each, value in median_m_by_coordinate.items()},
     )
 
 
@@ -425,7 +428,7 @@ def detect_outliers(analysis: Analysis) -> Findings:
     source_texts = find_source_texts(analysis)
     outlier_sizes_m, reference = compute_outlier_sizes_m(analysis, outlier_time_s)
     yield finding(
-        error_if(outlier_fraction >= MIN_OUTLIER_FRACTION_FOR_ERROR),
+        error_if(outlier_fraction >= MIN_OUTLIER_FRACTION_FOR_SEVERITY_ERROR),
         "source_outliers",
         f"{outlier_count} of {axis_tuning.count} {analysis.source.positions_text} "
         f"({format_percent(outlier_fraction, 1)}) are outliers of up to "

@@ -85,14 +85,14 @@ INVALID_POSITION_TEXTS: Mapping[str, tuple[str, str, str]] = {
 
 
 def detect(analysis: Analysis) -> Findings:
-    yield from detect_invalid_rows(analysis)
+    yield from detect_invalid_positions(analysis)
     yield from detect_rounding(analysis)
     yield from detect_lever_arm(analysis)
     yield from detect_two_senders(analysis)
     yield from detect_copied_estimate(analysis)
 
 
-def detect_invalid_rows(analysis: Analysis) -> Findings:
+def detect_invalid_positions(analysis: Analysis) -> Findings:
     source, segment = analysis.source, analysis.segment
     invalid_reasons = source.invalid_reasons[segment.start_s : segment.end_s]
     for reason, (name, fault, action) in INVALID_POSITION_TEXTS.items():
@@ -111,10 +111,10 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
         if is_long:
             # Last position before the span, and first position after it
             valid_times_s = analysis.input_axes[0].measurement_time_s
-            first, last = np.clip(
+            first_row, last_row = np.clip(
                 np.searchsorted(valid_times_s, (start_s, end_s)), 1, len(valid_times_s) - 1
             )
-            gap_span_s = float(valid_times_s[first - 1]), float(valid_times_s[last])
+            gap_span_s = float(valid_times_s[first_row - 1]), float(valid_times_s[last_row])
             error_text = f" {describe_errors_after_gap(analysis, gap_span_s)}"
         yield make_finding(
             name,
@@ -269,20 +269,22 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     # senders, it alternates between ± their distance: invert every other deviation
     deviations_m = position_m[1:-1] - (1.0 - weight) * position_m[:-2] - weight * position_m[2:]
     deviations_m[::2] *= -1.0
-    windows_m = deviations_m[: window_count * WINDOW_SAMPLES].reshape(
+    deviation_windows_m = deviations_m[: window_count * WINDOW_SAMPLES].reshape(
         window_count, WINDOW_SAMPLES, -1
     )
-    medians_m = np.median(windows_m, axis=1)
+    window_medians_m = np.median(deviation_windows_m, axis=1)
     # A lost sample inverts the later medians: give all the direction of the largest
-    largest_median_m = medians_m[np.argmax(np.linalg.norm(medians_m, axis=1))]
-    medians_m[medians_m @ largest_median_m < 0.0] *= -1.0
-    difference_between_senders_m = np.median(medians_m, axis=0)
+    largest_median_m = window_medians_m[np.argmax(np.linalg.norm(window_medians_m, axis=1))]
+    window_medians_m[window_medians_m @ largest_median_m < 0.0] *= -1.0
+    difference_between_senders_m = np.median(window_medians_m, axis=0)
     # σ from the median absolute deviation
-    scatter_m = 1.4826 * np.median(np.abs(medians_m - difference_between_senders_m), axis=0).max()
+    scatter_m = (
+        1.4826 * np.median(np.abs(window_medians_m - difference_between_senders_m), axis=0).max()
+    )
     distance_m = float(np.linalg.norm(difference_between_senders_m))
     if distance_m < max(MIN_SENDER_DISTANCE_M, MIN_SENDER_DISTANCE_SIGMAS * scatter_m):
         return
-    distance_texts = ", ".join(
+    distances_text = ", ".join(
         f"{abs(part):.2f} m {name.partition('_')[0]}"
         for part, name in zip(difference_between_senders_m, samples.columns, strict=True)
     )
@@ -290,7 +292,7 @@ def detect_two_senders(analysis: Analysis) -> Findings:
         "source_two_senders",
         f"Two systems alternately send positions that differ by {distance_m:.2f} m. After "
         f"subtraction of the vehicle's motion, successive {analysis.source.positions_text} "
-        f"({rate_hz:.3g} Hz in total) differ by {distance_texts}. {NO_ESTIMATES_SENTENCE}",
+        f"({rate_hz:.3g} Hz in total) differ by {distances_text}. {NO_ESTIMATES_SENTENCE}",
         "Send the positions of one system only: stop the second node, bridge or MAVROS plugin.",
         {"distance_m": distance_m, "rate_hz": rate_hz},
     )

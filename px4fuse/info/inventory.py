@@ -11,7 +11,7 @@ from px4fuse.comparison.comparison import project_tracks
 from px4fuse.comparison.flight_events import compute_max_interval_s
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.preparation import prepare_comparison_inputs, select_source_innovations
-from px4fuse.core.text import capitalise_first, format_utc_time, to_json_types
+from px4fuse.core.text import capitalise_first_letter, format_utc_time, to_json_types
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.inputs import prepare_inputs
 from px4fuse.errors import MissingDataError, Px4FuseError
@@ -32,7 +32,7 @@ from px4fuse.flight.model import (
     PositionTrack,
     Spans,
     Unavailable,
-    sample_rate,
+    compute_sample_rate_hz,
 )
 from px4fuse.info.tables import list_missing_data
 from px4fuse.request import ComparisonRequest, replace_argument_names
@@ -251,7 +251,7 @@ def _make_logged_data(
         data_fields["samples"] = len(data)
         times_s = data.index.tolist()
         if len(data) > 1:
-            data_fields["rate_hz"] = sample_rate(data)
+            data_fields["rate_hz"] = compute_sample_rate_hz(data)
             data_fields["gaps"] = _measure_gaps(data, is_imu=data_label == STREAM_LABELS["imu"])
     else:
         times_s = [time_s for span in data for time_s in span]
@@ -266,7 +266,7 @@ def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> GapStatistics:
     limit_s = (
         max(MIN_IMU_GAP_S, MIN_IMU_GAP_INTERVALS * float(np.median(intervals_s)))
         if is_imu
-        else float(compute_max_interval_s(1.0 / sample_rate(samples)))
+        else float(compute_max_interval_s(1.0 / compute_sample_rate_hz(samples)))
     )
     long_intervals_s = intervals_s[intervals_s > limit_s]
     return GapStatistics(
@@ -303,7 +303,7 @@ def _list_analyses(
         yield AnalysisOption("aiding sources of EKF2", False, results_by_aid.reason)
     elif isinstance(ekf2, Ekf2):
         rate_texts = (
-            f"{aid.label}: {sample_rate(samples):.2g} Hz"
+            f"{aid.label}: {compute_sample_rate_hz(samples):.2g} Hz"
             if len(samples := ekf2.aids[name].samples) > 1
             else f"{aid.label}: 1 sample"
             for name, aid in results_by_aid.items()
@@ -372,7 +372,7 @@ def _collect_logging_advice(
     purposes_by_action: dict[str, dict[str, None]] = {}
     for action, purpose in actions_and_purposes:
         if action:
-            purposes_by_action.setdefault(capitalise_first(action), {})[purpose] = None
+            purposes_by_action.setdefault(capitalise_first_letter(action), {})[purpose] = None
     return tuple(
         LoggingAdvice(action, tuple(purposes)) for action, purposes in purposes_by_action.items()
     )

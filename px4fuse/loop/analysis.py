@@ -11,7 +11,7 @@ from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
 from px4fuse.loop import loop_segment
-from px4fuse.loop.closure import choose_key_frames, compute_default_spacing_m, to_z_down
+from px4fuse.loop.closure import choose_key_frames, compute_default_key_frame_spacing_m, to_z_down
 from px4fuse.loop.corrections import (
     build_pose_graph,
     distribute_closure_error_by_distance,
@@ -104,7 +104,7 @@ def analyse(
         closures.insert(0, GivenClosure(segment.start_s, segment.end_s, true_end.sigma_m))
     key_frame_spacing_m = request.key_frames_m
     if key_frame_spacing_m is None:
-        key_frame_spacing_m = compute_default_spacing_m(path.position_m)
+        key_frame_spacing_m = compute_default_key_frame_spacing_m(path.position_m)
     key_frame_indices, distance_m = _choose_key_frames(path, key_frame_spacing_m)
     graph, node_indices, variance_note = build_pose_graph(
         path, key_frame_indices, closures, true_end, noise

@@ -13,13 +13,13 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.loop.closure import (
     DOWN_DIRECTION,
     compute_heading_change_rad,
-    correct_by_distance,
     distribute_by_distance,
+    remove_closure_error_by_distance,
 )
 from px4fuse.loop.model import (
     LANDING_CLOSURE_SOURCE,
-    Closure,
     CorrectionName,
+    LoopClosure,
     OdometryNoise,
     PathResult,
     TrueFinalPose,
@@ -179,30 +179,33 @@ def build_pose_graph(
         node_position_m[second_nodes] - node_position_m[first_nodes]
     )
     # A closure states that both poses have the same position; orientations have no information
-    landing_edge = len(step_indices)
-    for edge_index, closure in enumerate(closures, start=landing_edge):
+    landing_edge_index = len(step_indices)
+    for edge_index, closure in enumerate(closures, start=landing_edge_index):
         measured_translation_m[edge_index] = 0.0
         information[edge_index, range(3), range(3)] = closure.sigma_m**-2
     if not isinstance(true_end, Unavailable):
-        measured_translation_m[landing_edge] = first_rotation_inverse[landing_edge].apply(
-            true_end.displacement_vector_m
-        )
+        measured_translation_m[landing_edge_index] = first_rotation_inverse[
+            landing_edge_index
+        ].apply(true_end.displacement_vector_m)
         if true_end.heading_change_deg is not None:
             # Rotate the final node about the vertical, so that the edge has the true heading change
             odometry_heading_change_rad = compute_heading_change_rad(
-                second_node_rotation[landing_edge] * node_rotation[first_nodes[landing_edge]].inv()
+                second_node_rotation[landing_edge_index]
+                * node_rotation[first_nodes[landing_edge_index]].inv()
             )
             heading_correction_rad = float(
                 lie.wrap(np.radians(true_end.heading_change_deg) - odometry_heading_change_rad)
             )
-            second_node_rotation[landing_edge] = (
+            second_node_rotation[landing_edge_index] = (
                 Rotation.from_rotvec(heading_correction_rad * DOWN_DIRECTION)
-                * second_node_rotation[landing_edge]
+                * second_node_rotation[landing_edge_index]
             )
             # Only the rotation about the vertical is known; its axis in the frame of the final pose
-            vertical_direction = second_node_rotation[landing_edge].inv().apply(DOWN_DIRECTION)
+            vertical_direction = (
+                second_node_rotation[landing_edge_index].inv().apply(DOWN_DIRECTION)
+            )
             heading_sigma_rad = np.radians(true_end.sigma_heading_deg or 0.0)
-            information[landing_edge, 3:, 3:] = (
+            information[landing_edge_index, 3:, 3:] = (
                 np.outer(vertical_direction, vertical_direction) / heading_sigma_rad**2
             )
     graph = PoseGraph(
@@ -237,7 +240,7 @@ def distribute_closure_error_by_distance(
     distance_m: Array,
     closure_error_vector_m: Array | Unavailable,
     heading_error_deg: float | Unavailable,
-    closures: tuple[Closure, ...],
+    closures: tuple[LoopClosure, ...],
 ) -> dict[CorrectionName, CorrectionOutcome]:
     """Distribute the loop closure error along the path, in proportion to path length.
 
@@ -254,7 +257,7 @@ def distribute_closure_error_by_distance(
     heading_error_rad = (
         0.0 if isinstance(heading_error_deg, Unavailable) else float(np.radians(heading_error_deg))
     )
-    corrected_path = correct_by_distance(
+    corrected_path = remove_closure_error_by_distance(
         path, distance_m, closure_error_vector_m, heading_error_rad
     )
     return {
@@ -263,7 +266,7 @@ def distribute_closure_error_by_distance(
     }
 
 
-def _explain_gate_rejection(correction_name: str, closure: Closure) -> Unavailable:
+def _explain_gate_rejection(correction_name: str, closure: LoopClosure) -> Unavailable:
     return Unavailable(
         correction_name,
         f"the χ² gate rejects {closure} (squared Mahalanobis distance {closure.d2:.1f}, "
@@ -275,14 +278,14 @@ def _explain_gate_rejection(correction_name: str, closure: Closure) -> Unavailab
 
 def _gate_closures(
     graph: PoseGraph, closures: Sequence[GivenClosure], true_end: TrueFinalPose | Unavailable
-) -> tuple[Closure, ...]:
+) -> tuple[LoopClosure, ...]:
     """Test the loop closures against odometry with a χ² test.
 
     If ``true_end`` is known, the first closure is between take-off and landing.
     """
     edge_count = len(graph.first_nodes)
     gate_results = gate_edges(graph, np.arange(edge_count - len(closures), edge_count))
-    tested_closures: list[Closure] = []
+    tested_closures: list[LoopClosure] = []
     for closure, gate_result in zip(closures, gate_results, strict=True):
         error_m = graph.poses[gate_result.second, :3] - graph.poses[gate_result.first, :3]
         source = "given"
@@ -291,7 +294,7 @@ def _gate_closures(
             error_m = error_m - true_end.displacement_vector_m
             source = LANDING_CLOSURE_SOURCE
         tested_closures.append(
-            Closure(
+            LoopClosure(
                 **structs.asdict(closure),
                 source=source,
                 distance_m=float(np.linalg.norm(error_m)),
@@ -311,7 +314,7 @@ def solve_pose_graphs(
     given_closures: Sequence[GivenClosure],
     true_end: TrueFinalPose | Unavailable,
     progress: Progress,
-) -> tuple[dict[CorrectionName, CorrectionOutcome], tuple[Closure, ...]]:
+) -> tuple[dict[CorrectionName, CorrectionOutcome], tuple[LoopClosure, ...]]:
     """Test the loop closures, and optimise the pose graph.
 
     One optimisation uses the accepted closures. The other one is robust and uses all closures.

@@ -44,7 +44,7 @@ MIN_QUATERNION_NORM = 0.5
 
 
 @dataclass(frozen=True)
-class Layout:
+class MessageLayout:
     """Fields of a PX4 topic or MAVLink message, and the DataFrame columns that they become."""
 
     # PX4 topic or MAVLink message
@@ -59,7 +59,7 @@ class Layout:
     is_step_function: bool = False
 
 
-def expand_layouts(toml_tables: Mapping[str, Any]) -> dict[str, Layout]:
+def expand_layouts(toml_tables: Mapping[str, Any]) -> dict[str, MessageLayout]:
     """Convert TOML tables to definitions with one message field per column.
 
     By default, the topic or message is the name of the table.
@@ -72,7 +72,7 @@ def expand_layouts(toml_tables: Mapping[str, Any]) -> dict[str, Layout]:
             optional_columns=assign_fields_to_columns(layout.optional_columns),
             scale=assign_fields_to_columns(layout.scale),
         )
-        for name, layout in msgspec.convert(rows, dict[str, Layout]).items()
+        for name, layout in msgspec.convert(rows, dict[str, MessageLayout]).items()
     }
 
 
@@ -222,7 +222,7 @@ def interpolate_inside_time_span(time_s: pd.Index | Array, values: "pd.Series[fl
     return np.asarray(np.interp(time_s, values.index, values, np.nan, np.nan))
 
 
-def join_nearest(
+def join_nearest_samples(
     samples: pd.DataFrame, other_samples: pd.DataFrame, tolerance_s: float
 ) -> pd.DataFrame:
     """Join each sample with the sample of ``other_samples`` that is nearest in time.

@@ -298,11 +298,11 @@ def _count_bytes_outside_frames(
         gap_starts[is_gap].tolist(), gap_ends[is_gap].tolist(), strict=True
     ):
         offset = gap_start
-        while frame_bytes := _measure_unknown_frame(
+        while frame_size_bytes := _measure_unknown_frame(
             content, offset, gap_end, receive_time_size_bytes
         ):
             unknown_frame_count += 1
-            offset += frame_bytes
+            offset += frame_size_bytes
         byte_count_outside_frames += gap_end - offset
     bytes_after_last_frame = content[offset:]
     first_byte = bytes_after_last_frame[receive_time_size_bytes : receive_time_size_bytes + 1]
@@ -325,18 +325,20 @@ def _measure_unknown_frame(
     if header_offset + HEADER_BYTES_V1 > gap_end:
         return 0
     header = content[header_offset : header_offset + HEADER_BYTES_V2]
-    frame_bytes = receive_time_size_bytes + header[LENGTH_OFFSET] + CHECKSUM_BYTES
+    frame_size_bytes = receive_time_size_bytes + header[LENGTH_OFFSET] + CHECKSUM_BYTES
     if header[0] == MAGIC_BYTE_V1:
         message_id = header[MESSAGE_ID_OFFSET_V1]
-        frame_bytes += HEADER_BYTES_V1
+        frame_size_bytes += HEADER_BYTES_V1
     elif header[0] == MAGIC_BYTE_V2:
         message_id = int.from_bytes(header[MESSAGE_ID_OFFSET_V2:], "little")
-        frame_bytes += HEADER_BYTES_V2 + SIGNATURE_BYTES * (header[FLAGS_OFFSET_V2] & SIGNED_FLAG)
+        frame_size_bytes += HEADER_BYTES_V2 + SIGNATURE_BYTES * (
+            header[FLAGS_OFFSET_V2] & SIGNED_FLAG
+        )
     else:
         return 0
     # A frame with a known message has an invalid checksum: the valid frames are not in the gaps
     is_known = message_id in dialect.mavlink_map
-    return 0 if is_known or offset + frame_bytes > gap_end else frame_bytes
+    return 0 if is_known or offset + frame_size_bytes > gap_end else frame_size_bytes
 
 
 def _read_receive_times(

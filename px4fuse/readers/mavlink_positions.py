@@ -15,7 +15,12 @@ from px4fuse.flight.model import (
     Unavailable,
     find_source_origin,
 )
-from px4fuse.readers.common import Layout, join_nearest, read_attitude, read_orientation
+from px4fuse.readers.common import (
+    MessageLayout,
+    join_nearest_samples,
+    read_attitude,
+    read_orientation,
+)
 from px4fuse.readers.mavlink_frames import MavlinkAddress
 from px4fuse.readers.mavlink_messages import (
     CONVERSION_BY_MAV_FRAME,
@@ -28,7 +33,7 @@ from px4fuse.readers.mavlink_messages import (
     PositionMessageType,
 )
 from px4fuse.readers.mavlink_recording import BOOT_CLOCK_TEXT, RECEIPT_CLOCK_TEXT, Recording
-from px4fuse.readers.mavlink_senders import ClockMapping, find_senders
+from px4fuse.readers.mavlink_senders import SenderClockConversion, find_senders
 from px4fuse.readers.px4_positions import (
     FIX_TYPE_3D,
     MIN_TRACK_SAMPLES,
@@ -51,13 +56,13 @@ MAX_ORIGIN_TIME_DIFFERENCE_S = 0.05
 
 
 def read_positions(
-    recording: Recording, clocks: dict[MavlinkAddress, ClockMapping], delay_s: float
+    recording: Recording, clocks: dict[MavlinkAddress, SenderClockConversion], delay_s: float
 ) -> TracksAndMissingSources:
     """Read the external positions sent to the autopilot, and the GNSS positions.
 
     Parameters
     ----------
-    clocks : mapping from address to ClockMapping
+    clocks : mapping from address to SenderClockConversion
         Conversion of each sender's clock to the autopilot's boot clock.
     delay_s : float
         Delay (s) from GNSS measurement to timestamp that the autopilot assumes.
@@ -88,7 +93,7 @@ def _read_track(
     recording: Recording,
     source: PositionMessageType,
     sender: MavlinkAddress,
-    clock: ClockMapping,
+    clock: SenderClockConversion,
     senders: list[MavlinkAddress],
 ) -> PositionTrack | Unavailable | None:
     """Read the positions from one sender and message type; None without messages."""
@@ -138,7 +143,7 @@ def _read_track(
 
 
 def _read_gnss(
-    recording: Recording, layout: Layout, delay_s: float
+    recording: Recording, layout: MessageLayout, delay_s: float
 ) -> PositionTrack | Unavailable | None:
     """Read GNSS fixes as NED positions relative to the local origin; None without messages.
 
@@ -196,7 +201,7 @@ def find_local_origin(recording: Recording) -> GeodeticPosition | None:
     sent_origins = recording.read(MESSAGE_LAYOUTS["GPS_GLOBAL_ORIGIN"]).dropna()
     if len(sent_origins):
         return tuple(sent_origins.iloc[-1].tolist())
-    joined_positions = join_nearest(
+    joined_positions = join_nearest_samples(
         recording.read(MESSAGE_LAYOUTS["GLOBAL_POSITION_INT"]),
         recording.read(LOCAL_POSITION_LAYOUT)[Columns.POSITION],
         MAX_ORIGIN_TIME_DIFFERENCE_S,

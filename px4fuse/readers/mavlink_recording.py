@@ -18,7 +18,7 @@ from scipy.stats import theilslopes
 
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.flight.model import Columns, DataSource, time_index
-from px4fuse.readers.common import MAX_FIELD_VALUE, MIN_QUATERNION_NORM, Layout
+from px4fuse.readers.common import MAX_FIELD_VALUE, MIN_QUATERNION_NORM, MessageLayout
 from px4fuse.readers.mavlink_frames import (
     MavlinkAddress,
     MavlinkFrames,
@@ -55,7 +55,7 @@ MIN_DISTINCT_TIME_FRACTION = 0.1
 # Minimum backward step (s) of the boot clock at a restart
 MIN_BACKWARD_STEP_AT_RESTART_S = 5.0
 # Number of messages around a backward step of the timestamps that confirm a restart
-RESTART_CHECK_MESSAGES = 20
+RESTART_CHECK_MESSAGE_COUNT = 20
 # Timestamps without long gaps form a group. A group at the start or end of the recording is invalid
 # if it has fewer timestamps than this fraction of the largest group
 MIN_TIMESTAMP_GROUP_FRACTION = 0.01
@@ -187,13 +187,13 @@ class Recording:
         """Return the fields of all messages of one type from the autopilot, in MAVLink units."""
         return self.frames.table(message, self.rows(message))
 
-    def find_most_frequent(self, layouts: Sequence[Layout]) -> Layout:
+    def find_most_frequent_layout(self, layouts: Sequence[MessageLayout]) -> MessageLayout:
         """Return the layout of the message type that the autopilot sent most often."""
         return max(layouts, key=lambda layout: len(self.rows(layout.topic)))
 
     def read(
         self,
-        layout: Layout,
+        layout: MessageLayout,
         rows: IntArray | None = None,
         boot_times_s: Array | None = None,
         name: str = "",
@@ -204,7 +204,7 @@ class Recording:
 
         Parameters
         ----------
-        layout : Layout
+        layout : MessageLayout
             Message and fields to read.
         rows : ndarray, shape (n,), optional
             Frame indices; by default all frames from the autopilot.
@@ -403,11 +403,11 @@ def _find_restarts(boot_times_s: Array) -> IntArray:
     """Return the index of the first boot time after each restart of the autopilot.
 
     A backward step due to a single late or early packet is not a restart: the boot time is also
-    smaller between RESTART_CHECK_MESSAGES messages before and after the step.
+    smaller between RESTART_CHECK_MESSAGE_COUNT messages before and after the step.
     """
     rows = np.flatnonzero(np.diff(boot_times_s) < -MIN_BACKWARD_STEP_AT_RESTART_S) + 1
-    earlier_rows = np.maximum(rows - 1 - RESTART_CHECK_MESSAGES, 0)
-    later_rows = np.minimum(rows + RESTART_CHECK_MESSAGES, len(boot_times_s) - 1)
+    earlier_rows = np.maximum(rows - 1 - RESTART_CHECK_MESSAGE_COUNT, 0)
+    later_rows = np.minimum(rows + RESTART_CHECK_MESSAGE_COUNT, len(boot_times_s) - 1)
     times_before_s = np.minimum(boot_times_s[earlier_rows], boot_times_s[rows - 1])
     is_restart = boot_times_s[later_rows] < times_before_s - MIN_BACKWARD_STEP_AT_RESTART_S
     return rows[is_restart]

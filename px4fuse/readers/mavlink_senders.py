@@ -11,7 +11,7 @@ import numpy as np
 
 from px4fuse.core.arrays import Array, ArrayPair, IntArray
 from px4fuse.errors import SettingsError
-from px4fuse.flight.model import ClockMap, Sender
+from px4fuse.flight.model import ClockConversion, Sender
 from px4fuse.readers.mavlink_frames import VEHICLE_TYPES, MavlinkAddress, MavlinkFrames
 from px4fuse.readers.mavlink_messages import (
     AUTOPILOT_COMPONENT_ID,
@@ -52,14 +52,14 @@ MAX_REGULAR_SAMPLE_INTERVAL_S = 1.0
 
 
 @dataclass(frozen=True)
-class ClockMapping:
+class SenderClockConversion:
     """Conversion of a sender's timestamps to the autopilot's boot clock, with a description.
 
     ``sender_to_boot_fit`` is None if receive times replace the timestamps.
     """
 
     sender_to_boot_fit: ClockLine | None
-    description: ClockMap
+    description: ClockConversion
 
 
 def _read_vehicle_types(frames: MavlinkFrames) -> dict[MavlinkAddress, tuple[int, int]]:
@@ -146,7 +146,7 @@ def find_senders(recording: Recording, message: str) -> list[MavlinkAddress]:
     ][:MAX_SENDERS]
 
 
-def map_sender_clocks(recording: Recording) -> dict[MavlinkAddress, ClockMapping]:
+def map_sender_clocks(recording: Recording) -> dict[MavlinkAddress, SenderClockConversion]:
     """Return the conversion of each position sender's clock to the autopilot's boot clock."""
     message_names = {source.message for source in POSITION_MESSAGE_TYPES}
     senders = {address for message in message_names for address in find_senders(recording, message)}
@@ -158,7 +158,7 @@ def map_sender_clocks(recording: Recording) -> dict[MavlinkAddress, ClockMapping
 
 def _map_sender_clock(
     recording: Recording, sender: MavlinkAddress, boot_to_unix_fit: ClockLine | None
-) -> ClockMapping:
+) -> SenderClockConversion:
     frames = recording.frames
     rows, timestamps_s = [], []
     for source in POSITION_MESSAGE_TYPES:
@@ -215,7 +215,7 @@ def map_clock_to_boot(
     boot_to_unix_fit: ClockLine | None,
     *,
     has_receive_times: bool,
-) -> ClockMapping:
+) -> SenderClockConversion:
     """Find the conversion of a sender's clock to the autopilot's boot clock.
 
     The first conversion that applies is used:
@@ -255,9 +255,9 @@ def map_clock_to_boot(
         intervals_s = np.diff(receive_times_s)
         intervals_s = intervals_s[intervals_s < MAX_REGULAR_SAMPLE_INTERVAL_S]
         jitter_s = float(np.std(intervals_s) / np.sqrt(2.0)) if len(intervals_s) else 0.0
-        return ClockMapping(
+        return SenderClockConversion(
             None,
-            ClockMap(
+            ClockConversion(
                 name, time_source, len(timestamps_s), 0.0, 0.0, jitter_s, note, distinct_count
             ),
         )
@@ -322,21 +322,21 @@ def _fit_timesync(
 
 def _make_clock_mapping(
     clock: str, method: str, line: ClockLine, timestamps_s: Array, note: str
-) -> ClockMapping:
+) -> SenderClockConversion:
     middle_timestamp_s = 0.5 * float(timestamps_s.min() + timestamps_s.max())
     offset_s = float(line.at(middle_timestamp_s)) - middle_timestamp_s
     drift_ppm = (line.slope - 1.0) * 1e6
-    description = ClockMap(
+    description = ClockConversion(
         clock, method, line.reading_pair_count, offset_s, drift_ppm, line.jitter_s, note
     )
-    return ClockMapping(line, description)
+    return SenderClockConversion(line, description)
 
 
 def describe_clock_conversions(
-    recording: Recording, clock_mappings: dict[MavlinkAddress, ClockMapping]
-) -> tuple[ClockMap, ...]:
+    recording: Recording, clock_conversions: dict[MavlinkAddress, SenderClockConversion]
+) -> tuple[ClockConversion, ...]:
     """Describe the conversions of sender clocks and receive times to the boot clock."""
-    clock_descriptions = [mapping.description for mapping in clock_mappings.values()]
+    clock_descriptions = [mapping.description for mapping in clock_conversions.values()]
     receive_times_us = recording.frames.receive_times_us
     receive_to_boot_time_fit = recording.receive_to_boot_time_fit
     if receive_times_us is not None and receive_to_boot_time_fit.reading_pair_count:
@@ -347,7 +347,7 @@ def describe_clock_conversions(
                 "messages"
             )
         clock_descriptions.append(
-            ClockMap(
+            ClockConversion(
                 clock="receive time (UNIX time of the recording computer)",
                 method="receive time",
                 pairs=receive_to_boot_time_fit.reading_pair_count,
@@ -389,9 +389,9 @@ def _estimate_lost_fraction(frames: MavlinkFrames, address: MavlinkAddress) -> f
     """
     sequence_numbers = frames.sequence_numbers[frames.is_sent_by(address)].astype(np.int64)
     sequence_steps = np.mod(np.diff(sequence_numbers) + MAX_LATE_MESSAGES, 256) - MAX_LATE_MESSAGES
-    unwrapped_sequence = np.append(0, np.cumsum(sequence_steps))
-    sent_count = np.ptp(unwrapped_sequence) + 1
-    lost_fraction = float(1.0 - len(np.unique(unwrapped_sequence)) / sent_count)
-    has_sequence_numbers = len(unwrapped_sequence) == 1 or unwrapped_sequence.any()
+    unwrapped_sequence_numbers = np.append(0, np.cumsum(sequence_steps))
+    sent_count = np.ptp(unwrapped_sequence_numbers) + 1
+    lost_fraction = float(1.0 - len(np.unique(unwrapped_sequence_numbers)) / sent_count)
+    has_sequence_numbers = len(unwrapped_sequence_numbers) == 1 or unwrapped_sequence_numbers.any()
     is_usable = has_sequence_numbers and lost_fraction < MAX_LOST_MESSAGE_FRACTION
     return lost_fraction if is_usable else None

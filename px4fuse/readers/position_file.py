@@ -38,7 +38,7 @@ from px4fuse.readers.recording_table import (
     MIN_VALID_UNIX_TIME_S,
     PositionTable,
     choose_body,
-    find_table,
+    find_position_table,
     quote,
     refuse_foreign_format,
 )
@@ -54,7 +54,7 @@ MIN_USABLE_ROWS = 3
 # Minimum fraction of rows with the expected pattern, such as increasing times
 MIN_MATCHING_ROW_FRACTION = 0.9
 # Maximum median interval (s) of timestamps that are UNIX times
-MAX_UNIX_TIME_INTERVAL_S = 60.0
+MAX_MEDIAN_UNIX_TIMESTAMP_INTERVAL_S = 60.0
 # Maximum extent (m) of an indoor flight; otherwise, the positions are probably in mm
 MAX_INDOOR_EXTENT_M = 200.0
 # Maximum absolute coordinate; larger values are timestamps or damaged text
@@ -253,7 +253,7 @@ def _open_table(
         path, LogError, MAX_FILE_BYTES, remedy_if_empty="Copy or export the file again."
     )
     refuse_foreign_format(path, content, LogError)
-    table = find_table(path, content, columns, body_name)
+    table = find_position_table(path, content, columns, body_name)
     return table, hashlib.sha256(content).hexdigest(), len(content)
 
 
@@ -388,13 +388,15 @@ def _find_column_indices(table: PositionTable, wanted_columns: tuple[str, ...]) 
 
 
 def _interpret_given_columns(
-    table: PositionTable, column_meanings: Sequence[ColumnMeaning], given_names: tuple[str, ...]
+    table: PositionTable,
+    column_meanings: Sequence[ColumnMeaning],
+    given_column_names: tuple[str, ...],
 ) -> list[ColumnMeaning]:
     """Return the meanings of all columns if the user gave those of time, position and sigma.
 
     The axes are x, y, z in the given order, unless the names of the given columns state the axes.
     """
-    given_columns = _find_column_indices(table, given_names)
+    given_columns = _find_column_indices(table, given_column_names)
     time_column, *position_columns = given_columns[:4]
     sigma_columns = given_columns[4:]
     kept_kinds = ("tag",) if sigma_columns else ("tag", "sigma")
@@ -427,7 +429,7 @@ def _find_axes(
 ) -> tuple[str | None, PositionColumns]:
     """Return the frame of the position (None: unknown), and the column indices of its axes."""
     frame_and_axis_columns = find_position_columns(column_meanings)
-    assert frame_and_axis_columns  # find_table returns only tables with positions
+    assert frame_and_axis_columns  # find_position_table returns only tables with positions
     frame, (x_column, y_column, z_column) = frame_and_axis_columns
     if z_column is not None and numeric_table[z_column].isna().all():
         z_column = None
@@ -492,7 +494,7 @@ def _choose_time_unit(
     for unit, unit_s in SECONDS_BY_TIME_UNIT.items():
         is_unix = MIN_VALID_UNIX_TIME_S <= median_time * unit_s < MAX_VALID_UNIX_TIME_S
         interval_s = median_step * unit_s
-        if is_unix and interval_s <= MAX_UNIX_TIME_INTERVAL_S:
+        if is_unix and interval_s <= MAX_MEDIAN_UNIX_TIMESTAMP_INTERVAL_S:
             return unit, f"in {unit}, the timestamps are UNIX times between 2000 and 2100"
         if unit in plausible_intervals_s:
             min_interval_s, max_interval_s = plausible_intervals_s[unit]

@@ -123,13 +123,15 @@ def find_position_columns(
 
     Return None if no column contains a position.
     """
-    columns_by_name: dict[str, dict[str, int]] = {}
+    column_by_name_and_axis: dict[str, dict[str, int]] = {}
     for index, column in enumerate(column_meanings):
         if column.kind == "position":
-            columns_by_axis = columns_by_name.setdefault(column.name_without_axis_and_unit, {})
+            columns_by_axis = column_by_name_and_axis.setdefault(
+                column.name_without_axis_and_unit, {}
+            )
             columns_by_axis.setdefault(column.axis, index)
     for axis_count in (3, 2):
-        for columns_by_axis in columns_by_name.values():
+        for columns_by_axis in column_by_name_and_axis.values():
             for frame, axes in _AXIS_NAMES_BY_FRAME:
                 # x, y, z, w is a quaternion
                 if {*axes[:axis_count]} <= columns_by_axis.keys() and "w" not in columns_by_axis:

@@ -24,11 +24,11 @@ from px4fuse.flight.model import (
     sample_step_function,
 )
 from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.common import Layout, assign_fields_to_columns, join_nearest
+from px4fuse.readers.common import MessageLayout, assign_fields_to_columns, join_nearest_samples
 from px4fuse.readers.ulog_topics import Topics
 
 # Maximum time (s) between innovation and variance S; PX4 logs them every 0.5 s by default
-MAX_VARIANCE_TIME_DIFFERENCE_S = 0.6
+MAX_TIME_FROM_INNOVATION_TO_VARIANCE_S = 0.6
 # Column and PX4 field for the time of the last fusion
 LAST_FUSION_FIELD = {"last_fused_us": "time_last_fuse"}
 # Optional fields of the topics estimator_aid_src_*, by aiding source and column
@@ -214,7 +214,7 @@ def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
     Since v1.14, each aiding source has a topic ``estimator_aid_src_...``. Older topics contain all
     aiding sources, and repeat each innovation until the next fusion.
     """
-    log_by_aid = {}
+    aid_log_by_name = {}
     for name, aid in AIDS.items():
         enabled_flag = enabled_aids.get(name)
         aid_log = _read_aid_topic(topics, aid, enabled_flag)
@@ -225,8 +225,8 @@ def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
             if may_be_fused:
                 aid_log = _read_common_topics(topics, aid, enabled_flag)
         if aid_log is not None:
-            log_by_aid[name] = aid_log
-    return log_by_aid
+            aid_log_by_name[name] = aid_log
+    return aid_log_by_name
 
 
 def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
@@ -234,7 +234,7 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     all_aids = (*AIDS.values(), *STATUS_FLAGS.values())
     flag_names = {flag for aid in all_aids for group in aid.flags for flag in group.split("|")}
     flags = topics.primary_samples(
-        Layout(
+        MessageLayout(
             px4.STATUS_FLAGS_TOPIC,
             optional_columns={name: name for name in flag_names},
             is_step_function=True,
@@ -272,7 +272,9 @@ def _read_aid_topic(
     columns = {"fused": "fused", "rejected": "innovation_rejected"}
     for name, field in field_by_quantity.items():
         columns |= _assign_fields_by_axis(name, aid, field + "[]" * (len(aid.axes) > 1))
-    layout = Layout(f"estimator_aid_src_{aid.name}", columns, OPTIONAL_FIELDS.get(aid.name, {}))
+    layout = MessageLayout(
+        f"estimator_aid_src_{aid.name}", columns, OPTIONAL_FIELDS.get(aid.name, {})
+    )
     if topics.find_layout(layout) is None:  # return early: reading an empty table takes time
         return None
     samples = topics.primary_samples(layout).dropna()
@@ -296,15 +298,17 @@ def _read_common_topics(
         innovation_topic, variance_topic = px4.INNOVATION_TOPICS
         possible_layouts.append(
             [
-                Layout(innovation_topic, _assign_fields_by_axis("innovation", aid, aid.fields)),
-                Layout(variance_topic, _assign_fields_by_axis("variance", aid, aid.fields)),
+                MessageLayout(
+                    innovation_topic, _assign_fields_by_axis("innovation", aid, aid.fields)
+                ),
+                MessageLayout(variance_topic, _assign_fields_by_axis("variance", aid, aid.fields)),
             ]
         )
     if aid.ekf2_innovations_fields:
         field_by_column = _assign_fields_by_axis("innovation", aid, aid.ekf2_innovations_fields)
         variance_fields = aid.ekf2_innovations_fields.replace("innov", "innov_var")
         field_by_column |= _assign_fields_by_axis("variance", aid, variance_fields)
-        possible_layouts.append([Layout(px4.OLD_INNOVATION_TOPIC, field_by_column)])
+        possible_layouts.append([MessageLayout(px4.OLD_INNOVATION_TOPIC, field_by_column)])
     for layouts in possible_layouts:
         # The innovations are in the first topic, their variances in the last
         innovation = topics.primary_samples(layouts[0])[f"innovation_{aid.axes[0]}"]
@@ -314,8 +318,8 @@ def _read_common_topics(
         samples = topics.primary_samples(layouts[0], select_rows=_drop_repeats_and_zeros)
         if len(layouts) == 2:
             # The nearest variance S is used, because PX4 logs it at other times
-            samples = join_nearest(
-                samples, variance_samples.dropna(), MAX_VARIANCE_TIME_DIFFERENCE_S
+            samples = join_nearest_samples(
+                samples, variance_samples.dropna(), MAX_TIME_FROM_INNOVATION_TO_VARIANCE_S
             )
         samples = samples.dropna()
         if enabled_flag is not None:

@@ -9,27 +9,32 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.core.arrays import Array, ArrayPair, IntArray
-from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_MODE_PARAMETER, GNSS_POS, fill_with_defaults
+from px4fuse.flight.ekf2_parameters import (
+    EV_POS,
+    GNSS_MODE_PARAMETER,
+    GNSS_POS,
+    fill_parameters_with_defaults,
+)
 from px4fuse.flight.model import (
     HEIGHT_ONLY_REASON,
     SENDER_CLOCK,
-    ClockMap,
+    ClockConversion,
     Columns,
     Ekf2,
     PositionTrack,
     SourceOrigin,
     Truth,
     Unavailable,
+    compute_sample_rate_hz,
     describe_repeated_timestamps,
     infer_position_kind,
-    sample_rate,
     time_index,
 )
 from px4fuse.readers.common import (
     classify_invalid_positions,
     estimate_quantisation_step,
     interpolate_inside_time_span,
-    join_nearest,
+    join_nearest_samples,
     read_attitude,
     read_orientation,
     select_valid_rows,
@@ -40,10 +45,10 @@ from px4fuse.readers.px4_innovations import has_fused_aid
 from px4fuse.readers.px4_topics import (
     FRAME_BY_FIELD_VALUE,
     FUSED_OBSERVATION_TRACK_NAME,
-    GPS_POSITION,
+    GPS_POSITION_TOPIC,
     LOCAL_POSITION_LAYOUT,
     RECONSTRUCTED_TRACK_NAME,
-    SOURCE_TRACKS,
+    SOURCE_TRACK_NAMES,
     TOPIC_LAYOUTS,
     TRACK_SOURCES,
     find_track_layouts,
@@ -61,7 +66,7 @@ MAX_ARRIVAL_TO_PUBLICATION_DELAY_US = 100
 MIN_ARRIVAL_TIME_FRACTION = 0.9
 # Maximum time (s) between a height and the horizontal position with which it is combined: an error
 # of 2.5 cm at 0.5 m/s
-MAX_HEIGHT_TIME_DIFFERENCE_S = 0.05
+MAX_TIME_FROM_POSITION_TO_HEIGHT_S = 0.05
 # At a lower rate (Hz), the logger dropped GNSS fixes; receivers send 5 to 20 Hz
 MAX_DOWNSAMPLED_HZ = 4.0
 POSITION_STATUS_COLUMNS = ["reset_counter", "quality", "age_s"]
@@ -88,7 +93,7 @@ def read_positions(topics: Topics, ekf2: Ekf2 | Unavailable) -> TracksAndMissing
     is_odometry = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags["yaw"] > 0).any())
     return split_tracks(
         [
-            *(_read_logged_track(topics, name) for name in SOURCE_TRACKS),
+            *(_read_logged_track(topics, name) for name in SOURCE_TRACK_NAMES),
             _read_fused_observation(topics, is_odometry),
             _reconstruct_track(topics, ekf2, is_odometry),
             _read_gnss_track(topics, ekf2),
@@ -200,7 +205,7 @@ def _make_ulog_track(
     )
 
 
-def _describe_clock_without_measurement_times(topics: Topics, topic: str) -> ClockMap | None:
+def _describe_clock_without_measurement_times(topics: Topics, topic: str) -> ClockConversion | None:
     """Describe the timestamps of a topic if they are not measurement times; otherwise return None.
 
     PX4 logs arrival times until it has received 500 TIMESYNC replies (``Timesync.cpp``).
@@ -222,7 +227,7 @@ def _describe_clock_without_measurement_times(topics: Topics, topic: str) -> Clo
             SENDER_CLOCK, len(sample_timestamps_us), len(np.unique(sample_timestamps_us))
         )
     # Offset, drift and jitter are zero, because no clock is converted
-    return ClockMap(clock_name, "arrival time", len(age_us), 0.0, 0.0, 0.0, note)
+    return ClockConversion(clock_name, "arrival time", len(age_us), 0.0, 0.0, 0.0, note)
 
 
 def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable:
@@ -230,8 +235,8 @@ def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable
     if layout is None:
         return unavailable_source(name)
     # EKF2's topics have one instance for each EKF2 instance
-    is_ekf2 = layout.topic.startswith("estimator_")
-    samples = topics.primary_samples(layout) if is_ekf2 else topics.read_instance(layout)
+    is_ekf2_topic = layout.topic.startswith("estimator_")
+    samples = topics.primary_samples(layout) if is_ekf2_topic else topics.read_instance(layout)
     frame = TRACK_SOURCES[name].frame
     for frame_field, frame_names in FRAME_BY_FIELD_VALUE.items():
         if frame == "unknown" and frame_field in samples and len(samples):
@@ -248,7 +253,7 @@ def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable
         name,
         samples,
         (layout.topic,),
-        notes=(note,) if instance_count > 1 and not is_ekf2 else (),
+        notes=(note,) if instance_count > 1 and not is_ekf2_topic else (),
         is_odometry=orientation is not None,
         frame=frame,
         clock_map=_describe_clock_without_measurement_times(topics, layout.topic),
@@ -309,13 +314,14 @@ def _make_track_from_ekf2_topics(
     """
     notes: tuple[str, ...] = ()
     if len(height_samples):
-        samples = join_nearest(
-            samples, height_samples.assign(_found=True), MAX_HEIGHT_TIME_DIFFERENCE_S
+        samples = join_nearest_samples(
+            samples, height_samples.assign(_found=True), MAX_TIME_FROM_POSITION_TO_HEIGHT_S
         )
         if missing_count := samples.pop("_found").isna().sum():
             notes = (
                 f"{missing_count} of {len(samples)} external vision positions have no height "
-                f"within {1e3 * MAX_HEIGHT_TIME_DIFFERENCE_S:.0f} ms and are used without height",
+                f"within {1e3 * MAX_TIME_FROM_POSITION_TO_HEIGHT_S:.0f} ms and are used without "
+                "height",
             )
     shift_s += topics.log.parameters.get(EV_POS.delay, 0.0) * 1e-3
     return _make_ulog_track(
@@ -374,19 +380,23 @@ def project(latitude_deg: Array, longitude_deg: Array, origin: GeodeticPosition)
     """
     origin_latitude_rad, origin_longitude_rad = np.radians(origin[:2])
     latitude_rad = np.radians(latitude_deg)
-    longitude_step_rad = np.radians(longitude_deg) - origin_longitude_rad
+    longitude_difference_rad = np.radians(longitude_deg) - origin_longitude_rad
     sin_latitude, cos_latitude = np.sin(latitude_rad), np.cos(latitude_rad)
     sin_origin, cos_origin = np.sin(origin_latitude_rad), np.cos(origin_latitude_rad)
-    cos_longitude_step = np.cos(longitude_step_rad)
+    cos_longitude_difference = np.cos(longitude_difference_rad)
     arc_rad = np.arccos(
         np.clip(
-            sin_origin * sin_latitude + cos_origin * cos_latitude * cos_longitude_step, -1.0, 1.0
+            sin_origin * sin_latitude + cos_origin * cos_latitude * cos_longitude_difference,
+            -1.0,
+            1.0,
         )
     )
     # arc/sin(arc) · radius, equal to the radius at the origin
     scale_m = EARTH_RADIUS_M / np.sinc(arc_rad / np.pi)
-    north_m = scale_m * (cos_origin * sin_latitude - sin_origin * cos_latitude * cos_longitude_step)
-    return north_m, scale_m * cos_latitude * np.sin(longitude_step_rad)
+    north_m = scale_m * (
+        cos_origin * sin_latitude - sin_origin * cos_latitude * cos_longitude_difference
+    )
+    return north_m, scale_m * cos_latitude * np.sin(longitude_difference_rad)
 
 
 def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition | ArrayPair) -> ArrayPair:
@@ -437,17 +447,17 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     EKF2 subtracts EKF2_GPS_DELAY from the timestamps. Since 2026, it may use the measurement times
     of the GNSS driver instead (EKF2.cpp UpdateGpsSample, estimator_interface.cpp).
     """
-    layout = topics.find_layout(*find_track_layouts(GPS_POSITION))
+    layout = topics.find_layout(*find_track_layouts(GPS_POSITION_TOPIC))
     if layout is None:
-        return unavailable_source(GPS_POSITION)
+        return unavailable_source(GPS_POSITION_TOPIC)
     messages = topics.read_instance(layout)
     messages["published_s"] = (messages.pop("published_us") - topics.time_origin_us) * 1e-6
     has_fix = messages.get("fix_type", pd.Series(FIX_TYPE_3D, messages.index)) >= FIX_TYPE_3D
     fixes = messages[has_fix]
     if fixes.empty:
         return unavailable_source(
-            GPS_POSITION,
-            f"the log has {len(messages)} {GPS_POSITION}, none with a 3D fix",
+            GPS_POSITION_TOPIC,
+            f"the log has {len(messages)} {GPS_POSITION_TOPIC}, none with a 3D fix",
             NO_FIX_ACTION,
         )
     parameters = topics.ekf2_parameters
@@ -458,17 +468,17 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         delay_s = 0.0
         clock = "autopilot boot clock: measurement times from the GNSS driver"
     else:
-        delay_s = fill_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
+        delay_s = fill_parameters_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
         fixes = fixes.set_axis(time_index(fixes["published_s"].to_numpy() - delay_s))
         clock = f"autopilot boot clock: timestamp minus {GNSS_POS.delay} ({1e3 * delay_s:g} ms)"
     unlogged_fixes = read_unlogged_fixes(topics, fixes, ekf2)
     if len(unlogged_fixes):
         fixes = pd.concat([fixes, unlogged_fixes]).sort_index()
-        interpolated_count = fixes["altitude_m"].isna().sum()
+        interpolated_altitude_count = fixes["altitude_m"].isna().sum()
         # Copy fields that EKF2's topics do not contain from the previous fix
         fixes = fixes.assign(altitude_m=fixes["altitude_m"].interpolate("index")).ffill()
     samples = convert_gnss_fixes(fixes, _find_local_origin(topics))
-    rate_hz = sample_rate(samples)
+    rate_hz = compute_sample_rate_hz(samples)
     notes, is_downsampled = list[str](), rate_hz < MAX_DOWNSAMPLED_HZ
     if is_downsampled:
         notes.append(
@@ -478,7 +488,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     if len(unlogged_fixes):
         notes.append(
             f"{len(unlogged_fixes)} GNSS fixes missing in the GNSS topic are read from "
-            f"estimator_aid_src_gnss_pos ({interpolated_count} with interpolated height)"
+            f"estimator_aid_src_gnss_pos ({interpolated_altitude_count} with interpolated height)"
         )
     elif is_downsampled:
         reconstructed_fixes, note = reconstruct_fixes(samples, ekf2, delay_s)
@@ -492,7 +502,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     times_without_fix_s = messages["published_s"].to_numpy()[~has_fix] - delay_s
     return _make_ulog_track(
         topics,
-        GPS_POSITION,
+        GPS_POSITION_TOPIC,
         samples,
         (layout.topic,),
         clock=clock,

@@ -42,7 +42,7 @@ _NUMBER_PATTERN = re.compile(
     r"[+-]?(?:(?:[0-9]+\.?|[0-9]*\.[0-9]+)(?:e[+-]?[0-9]+)?|nan|inf)", re.IGNORECASE
 )
 _TEXT_FORMATS = read_toml(__file__, dict[str, list[dict[str, Any]]], "formats.toml")
-_ISO_DATE = re.compile(r"\d{4}-\d\d-\d\d")
+_ISO_DATE_PATTERN = re.compile(r"\d{4}-\d\d-\d\d")
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class PositionTable:
     rows_text: str
     separator: str = ","
     # Line number of the header, 0 without header; None for formats without lines
-    header_line: int | None = None
+    header_line_number: int | None = None
     # Possible coordinate frames; empty if all are possible
     frames: tuple[str, ...] = ()
     # Frame rate, if the time column contains frame numbers
@@ -70,9 +70,8 @@ class PositionTable:
         """Describe the file format, or separator and header of a table with a header."""
         if self.format:
             return f"the file format is {self.format}"
-        return (
-            f"the separator is {SEPARATORS[self.separator]}, the header is line {self.header_line}"
-        )
+        separator_name = SEPARATORS[self.separator]
+        return f"the separator is {separator_name}, the header is line {self.header_line_number}"
 
     def format_labels(self, *columns: int | None) -> str:
         """Join the names of columns for a message to the user."""
@@ -86,7 +85,9 @@ class PositionTable:
     def format_first_line_number(self, rows: pd.Index) -> str:
         """Return the line number of the first row as text, such as " (first: line 7)"."""
         return (
-            "" if self.header_line is None else f" (first: line {self.header_line + 1 + rows[0]})"
+            ""
+            if self.header_line_number is None
+            else f" (first: line {self.header_line_number + 1 + rows[0]})"
         )
 
     def check_row_width(self) -> None:
@@ -184,7 +185,7 @@ def choose_body(file_name: str, body_names: Iterable[str], wanted_body: str | No
     )
 
 
-def find_table(
+def find_position_table(
     path: Path, content: bytes, columns: tuple[str, ...] | None, body: str | None
 ) -> PositionTable:
     """Find the table of positions in a file.
@@ -324,7 +325,7 @@ def _find_body_table(
         "OptiTrack Motive CSV export" if is_motive else "Vicon Nexus CSV export",
         [*first_columns, *column_names.where(is_chosen, "")[2:]],
         rows_text,
-        header_line=axes_row + 1,
+        header_line_number=axes_row + 1,
         # Motive exports y up by default, or z up; the file does not state which
         frames=("eus", "enu") if is_motive else (),
         rate_hz=None if is_motive else float(rows[1][0]),
@@ -386,7 +387,7 @@ def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> Posit
             continue
         if separator == " " and len(fields) == 12:  # matrix of 3 rows and 4 columns
             return _read_kitti_table(path, text)
-        if is_number(decimal_fields[0]) or _ISO_DATE.match(fields[0]):
+        if is_number(decimal_fields[0]) or _ISO_DATE_PATTERN.match(fields[0]):
             name, quaternion_order = HEADERLESS_TABLE_FORMAT, ""
             if separator in " \t" and len(fields) == 8:
                 name, quaternion_order = "TUM trajectory", "xyzw"
@@ -412,13 +413,13 @@ def _read_kitti_table(path: Path, text: str) -> PositionTable:
     # imported here, because most recordings need no rotations
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
 
-    name, times_name = display_name(path), f"{path.stem}_times.txt"
-    candidate_paths = (path.with_name(times_name), path.with_name("times.txt"))
+    name, times_file_name = display_name(path), f"{path.stem}_times.txt"
+    candidate_paths = (path.with_name(times_file_name), path.with_name("times.txt"))
     times_path = next(filter(Path.is_file, candidate_paths), None)
     if times_path is None:
         raise LogError(
             f"{name}: the file contains KITTI poses, which have no times",
-            f"Save the times (s), one per line, as {times_name} in the same folder.",
+            f"Save the times (s), one per line, as {times_file_name} in the same folder.",
         )
     time_texts = read_text(times_path, LogError, MAX_FILE_BYTES).split()
     try:

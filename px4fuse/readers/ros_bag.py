@@ -10,8 +10,8 @@ import numpy as np
 from px4fuse.core.reading import (
     LOG_SIZE_REMEDY,
     display_name,
-    file_size,
     format_size_limit,
+    get_file_size,
     list_files_recursively,
     max_log_bytes,
 )
@@ -81,7 +81,7 @@ def read_bag(path: Path, topic: str | None) -> tuple[PositionTable, str, int]:
             "Run pip install 'px4fuse[ros]'.",
         ) from None
     files = list_files_recursively(path) if path.is_dir() else [path]
-    size_bytes = sum(file_size(file, LogError) for file in files)
+    size_bytes = sum(get_file_size(file, LogError) for file in files)
     if size_bytes > max_log_bytes.get():
         raise LogError(format_size_limit(name, size_bytes, max_log_bytes.get()), LOG_SIZE_REMEDY)
     sha256 = hashlib.sha256()

@@ -39,7 +39,7 @@ MAX_TILT_RAD = math.radians(20.0)
 # Minimum fraction of intervals near the median interval, for a regular frame rate
 MIN_REGULAR_INTERVAL_FRACTION = 0.9
 # Maximum relative difference of a regular interval from the median interval
-MAX_MEDIAN_INTERVAL_DEVIATION = 0.5
+MAX_RELATIVE_DEVIATION_FROM_MEDIAN_INTERVAL = 0.5
 # Minimum duration of a gap between two poses ÷ median interval between poses
 MIN_GAP_IN_MEDIAN_INTERVALS = 2.5
 # Minimum duration (s) of a gap between two poses
@@ -197,7 +197,7 @@ def _describe_gaps(time_s: Array) -> str:
     """Return a note on gaps or irregular intervals between poses; "" if there are none."""
     intervals_s = np.diff(time_s)
     median_interval_s = np.median(intervals_s)
-    max_deviation_s = MAX_MEDIAN_INTERVAL_DEVIATION * median_interval_s
+    max_deviation_s = MAX_RELATIVE_DEVIATION_FROM_MEDIAN_INTERVAL * median_interval_s
     is_regular = np.abs(intervals_s - median_interval_s) <= max_deviation_s
     if np.mean(is_regular) < MIN_REGULAR_INTERVAL_FRACTION:
         return (

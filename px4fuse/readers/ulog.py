@@ -20,7 +20,7 @@ from px4fuse.readers.px4_ekf2 import read_ekf2
 from px4fuse.readers.px4_positions import FIX_TYPE_3D, barometer, read_positions, read_truth
 from px4fuse.readers.px4_topics import (
     DEFAULT_PROFILE_REMEDY,
-    GPS_POSITION,
+    GPS_POSITION_TOPIC,
     IMU_LAYOUT,
     TOPIC_LAYOUTS,
     UNUSED_TOPICS,
@@ -124,7 +124,7 @@ def _describe_damage(
 
 def _estimate_start_unix_s(topics: Topics) -> float | None:
     """Return the UNIX time (s) at flight time zero, from GNSS; None if not logged."""
-    fixes = topics.read(*find_track_layouts(GPS_POSITION))
+    fixes = topics.read(*find_track_layouts(GPS_POSITION_TOPIC))
     fixes = fixes.reindex(columns=["utc_us", "fix_type"])
     unix_time_s = fixes["utc_us"] * 1e-6
     is_valid = unix_time_s.between(*VALID_UNIX_TIME_RANGE_S) & ~(fixes["fix_type"] < FIX_TYPE_3D)
@@ -132,7 +132,7 @@ def _estimate_start_unix_s(topics: Topics) -> float | None:
 
 
 def _require_samples(
-    topics: Topics, samples: pd.DataFrame, name: str, layout: common.Layout, remedy: str
+    topics: Topics, samples: pd.DataFrame, name: str, layout: common.MessageLayout, remedy: str
 ) -> TableOrUnavailable:
     """Return the samples of a topic, or the reason if there are fewer than two."""
     topic = layout.topic

@@ -13,8 +13,8 @@ from px4fuse.analysis import AidingSourceAnalysis, Analysis
 from px4fuse.card.model import (
     RATIO_AXIS_TICKS,
     AidConsistency,
-    Card,
     DiagnosedCause,
+    DiagnosisCard,
     Verdict,
     map_ratio_to_axis,
 )
@@ -24,10 +24,10 @@ from px4fuse.comparison.comparison import (
 )
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, select_north_and_east
 from px4fuse.core.arrays import Array
-from px4fuse.core.text import format_metres, format_ratio, one_line
+from px4fuse.core.text import format_metres, format_ratio, shorten_to_line
 from px4fuse.filter.consistency import Reference
 from px4fuse.filter.kalman import predict_track
-from px4fuse.filter.signals import AISLE, cut_to_segment
+from px4fuse.filter.signals import AISLE_AXIS, cut_to_segment
 from px4fuse.finding import format_spans
 from px4fuse.flight.model import Ekf2, Truth
 from px4fuse.report import style
@@ -36,12 +36,12 @@ from px4fuse.report.card_text import (
     QUANTITY_LABELS,
     SEVERITY_SIGNS,
     format_consistent_ratios,
+    format_notes,
     format_rerun_note,
     label_alternatives,
     list_flight_texts,
     locate_sigma_ratio,
     make_rerun_rows,
-    note_texts,
 )
 from px4fuse.report.page import (
     AXES_LEFT_MARGIN,
@@ -77,7 +77,7 @@ AIDS_TERMS_NOTE = (
 )
 ALL_FINDINGS_TITLE = "All findings"
 # Tracks with a larger ratio of length to width can have a map of full page width
-MIN_ELONGATED_TRACK_RATIO = 2.2
+MIN_LENGTH_TO_WIDTH_RATIO_OF_WIDE_MAP = 2.2
 MIN_WIDE_MAP_HEIGHT = 95.0  # points
 MAP_HEIGHT_FRACTION = 0.33  # of the height of all plots
 # With less free height (points) on the first page, the plots are on the next page
@@ -102,7 +102,7 @@ def draw_pages(analysis: Analysis | AidingSourceAnalysis, results: FlightResults
     yield page
 
 
-def add_card(page: Page, card: Card) -> PageBlock:
+def add_card(page: Page, card: DiagnosisCard) -> PageBlock:
     """Add a diagnosis card (faults, causes and actions) to a page."""
     direction_text = f", {card.effect.axis}" if card.effect else ""
     ratio_text = f"RMS of actual error ÷ reported σ{direction_text}"
@@ -118,7 +118,7 @@ def add_card(page: Page, card: Card) -> PageBlock:
         more_causes=card.more_causes,
         sign=SEVERITY_SIGNS[card.severity],
         colour=SEVERITY_COLOURS[card.severity],
-        file=one_line(card.identity.file, MAX_FILE_NAME_LENGTH),
+        file=shorten_to_line(card.identity.file, MAX_FILE_NAME_LENGTH),
         flight=" · ".join(list_flight_texts(card)),
         axis_text=AIDS_CAPTION if card.aids else ratio_text,
         axis_legend=(
@@ -128,7 +128,7 @@ def add_card(page: Page, card: Card) -> PageBlock:
         ticks=[(map_ratio_to_axis(tick), label) for tick, label in RATIO_AXIS_TICKS.items()],
         rows=[*map(_make_verdict_row, card.verdicts), *map(_make_aid_row, card.aids)],
         causes=list(map(_make_cause_fields, card.causes)),
-        notes=note_texts(card),
+        notes=format_notes(card),
         terms=AIDS_TERMS_NOTE if card.aids else TERMS_NOTE,
         blocks=[],
     )
@@ -198,7 +198,9 @@ class TimePlot(NamedTuple):
     draw: Callable[[Axes], None]
 
 
-def write_panels(block: PageBlock, analysis: Analysis, card: Card, free_height: float) -> None:
+def write_panels(
+    block: PageBlock, analysis: Analysis, card: DiagnosisCard, free_height: float
+) -> None:
     """Draw legend, map and plots over time on the first page."""
     page = Page()
     block["blocks"] = page.blocks
@@ -211,7 +213,10 @@ def write_panels(block: PageBlock, analysis: Analysis, card: Card, free_height: 
         page.blocks.insert(0, {"kind": "break"})
     length_m, width_m = np.ptp(tracks["positions"], axis=1)
     map_height = MAP_HEIGHT_FRACTION * plots_height
-    if length_m > MIN_ELONGATED_TRACK_RATIO * width_m and map_height > MIN_WIDE_MAP_HEIGHT:
+    if (
+        length_m > MIN_LENGTH_TO_WIDTH_RATIO_OF_WIDE_MAP * width_m
+        and map_height > MIN_WIDE_MAP_HEIGHT
+    ):
         _draw_map(page, analysis, tracks, map_labels, map_height)
         _draw_plots(page, analysis, plots, plots_height - map_height)
         return
@@ -239,7 +244,7 @@ def _draw_plots(
         plot.draw(axes)
 
 
-def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
+def _make_error_plots(analysis: Analysis, card: DiagnosisCard) -> list[TimePlot]:
     """Return plots of the position errors of KF and EKF2, or of their difference."""
     result, effect = analysis.main.with_whole_flight_tracks(), card.effect
     plots: list[tuple[str, float | None, pd.Series[float], SigmaByFilter]] = []
@@ -285,11 +290,15 @@ def _make_error_plot(
         name: sigma.dropna() for name, sigma in sigmas_m.items() if sigma.notna().any()
     }
     title += " –" if rms_m is None else f" {format_metres(rms_m)}"
-    is_difference = len(sigmas_m) > 1
+    is_difference_of_filters = len(sigmas_m) > 1
     for name, sigma in known_sigmas_m.items():
-        label = f"σ of {name}" if is_difference else "σ"
+        label = f"σ of {name}" if is_difference_of_filters else "σ"
         title += f", median {label} {format_metres(sigma.median())}"
-    line = style.line_style("black", 1.0) if is_difference else TRACK_STYLES[next(iter(sigmas_m))]
+    line = (
+        style.line_style("black", 1.0)
+        if is_difference_of_filters
+        else TRACK_STYLES[next(iter(sigmas_m))]
+    )
 
     def draw(axes: Axes) -> None:
         axes.set_ylim(-half_range_m, half_range_m)
@@ -303,7 +312,7 @@ def _make_error_plot(
 
 def _make_innovation_plot(result: AxisComparison) -> TimePlot:
     innovations = normalised_innovations(result)
-    legend = ", ".join(f"{style.INNOVATION_SIGNS[name]} {name}" for name in innovations)
+    legend = ", ".join(f"{style.INNOVATION_SYMBOLS[name]} {name}" for name in innovations)
     title = f"Innovations ÷ √S ({legend}): 95 % expected within ±2"
     clipped_value_texts = [
         f"{name} {format_ratio(ratio)}"
@@ -330,7 +339,7 @@ def _rotate_map_tracks(analysis: Analysis) -> tuple[dict[str, Array], tuple[str,
     the right, m upwards.
     """
     aisle_heading_deg = next(
-        (line.heading_deg for line in analysis.input_axes if line.name == AISLE), None
+        (line.heading_deg for line in analysis.input_axes if line.name == AISLE_AXIS), None
     )
     heading_rad, labels = np.pi / 2.0, ("east", "north")
     if aisle_heading_deg is not None:

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.ekf2.replay import Agreement
+from px4fuse.ekf2.replay import ReplayAgreement
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.flight.model import Unavailable
@@ -58,15 +58,15 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     )
     page.add_columns(left_column, right_column)
     difference_m = pd.Series(explanation.kf_minus_ekf2_m, explanation.times_s)
-    worst_row = int(np.argmax(np.abs(explanation.kf_minus_ekf2_m)))
+    largest_difference_row = int(np.argmax(np.abs(explanation.kf_minus_ekf2_m)))
     axes = add_time_panel(
         page,
         analysis,
         "Position difference KF - EKF2 (m): total (dark) and unexplained part (light)",
         TIME_PLOT_HEIGHT,
         caption="Largest difference KF - EKF2: "
-        f"{abs(explanation.kf_minus_ekf2_m[worst_row]):.2g} m at "
-        f"{explanation.times_s[worst_row]:.1f} s.",
+        f"{abs(explanation.kf_minus_ekf2_m[largest_difference_row]):.2g} m at "
+        f"{explanation.times_s[largest_difference_row]:.1f} s.",
     )
     unexplained_difference_m = pd.Series(explanation.unexplained_difference_m, explanation.times_s)
     for start, end in explanation.spans_s:
@@ -88,7 +88,7 @@ def describe_missing_explanation(analysis: Analysis) -> str:
     )
 
 
-def format_replay_agreement(agreement: Agreement) -> str:
+def format_replay_agreement(agreement: ReplayAgreement) -> str:
     sentences = [
         f"{'agrees' if agreement.good else 'does not agree'} with the log ({agreement.reason})",
         *(
@@ -104,12 +104,16 @@ def _draw_contributions(
     column: Page,
     title: str,
     reduction_by_setting: Mapping[str, float],
-    unexplained: float,
-    total: float,
+    unexplained_mean_square: float,
+    total_mean_square: float,
 ) -> None:
     """Draw the contribution (%) of each setting to the mean square difference KF - EKF2."""
     names = [*reduction_by_setting, "unexplained"]
-    percents = 100.0 / total * np.array([*reduction_by_setting.values(), unexplained])
+    percents = (
+        100.0
+        / total_mean_square
+        * np.array([*reduction_by_setting.values(), unexplained_mean_square])
+    )
     axes = column.add_panel(title, BAR_ROW_HEIGHT * len(names), left_margin=LABEL_WIDTH)
     rows = range(len(names))
     axes.barh(rows, percents, height=0.7, color=KF_BAND_COLOUR, edgecolor=KF_COLOUR, lw=0.6)

@@ -6,7 +6,7 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.core.text import (
-    capitalise_first,
+    capitalise_first_letter,
     format_count,
     format_number,
     format_p_value,
@@ -155,8 +155,8 @@ def _write_ate(page: Page, loop: Loop) -> None:
 def _write_segment(page: Page, loop: Loop) -> None:
     odometry, true_end = loop.odometry.trajectory, loop.true_end
     true_end_text = "not used" if isinstance(true_end, Unavailable) else true_end.source
-    page.write_labelled("True end", true_end_text)
-    page.write_labelled(
+    page.write_labelled_text("True end", true_end_text)
+    page.write_labelled_text(
         "Track",
         f"{odometry.name}, {_format_span(loop)}, {loop.part_reason}: {len(odometry)} poses, "
         f"{loop.key_frames} key frames, spacing {loop.key_frame_spacing_m:.2g} m",
@@ -167,7 +167,8 @@ def _write_closures(page: Page, loop: Loop) -> None:
     for closure in loop.closures:
         verb = "accepted" if closure.accepted else "rejected"
         text = (
-            f"{capitalise_first(f'{closure}'.removeprefix('the '))}: {verb} by the χ² test (error "
+            f"{capitalise_first_letter(f'{closure}'.removeprefix('the '))}: {verb} by the χ² test "
+            "(error "
             f"{closure.distance_m:.2f} m, {format_p_value(closure.p)})"
         )
         if closure.weight_gnc is not None:
@@ -199,7 +200,7 @@ def _write_rpe(page: Page, loop: Loop) -> None:
         if rpe_rows:
             page.add_table(head, rpe_rows)
         for note in notes:
-            page.write_muted_text(capitalise_first(note))
+            page.write_muted_text(capitalise_first_letter(note))
 
 
 def _format_span(loop: Loop) -> str:
@@ -230,13 +231,13 @@ def _describe_closure_error(loop: Loop) -> str:
 def make_pose_graph_page(graph: Graph) -> Page:
     """Make the terminal output of ``px4fuse loop`` for a solved pose graph."""
     page, gates = Page(), graph.gates
-    page.write_labelled(
+    page.write_labelled_text(
         "Graph",
         f"{graph.name}: {graph.dimension}-D, {graph.poses} poses, {graph.edges} edges; initial "
         f"poses: {graph.initialised}",
     )
-    chi2, (expected_low, expected_high) = graph.reduced_chi2, graph.reduced_chi2_interval
-    if expected_high > 0.0:
+    chi2, (min_expected_chi2, max_expected_chi2) = graph.reduced_chi2, graph.reduced_chi2_interval
+    if max_expected_chi2 > 0.0:
         cause_text = ""
         if (factor := graph.information_factor) > 1.0:
             cause_text = (
@@ -244,24 +245,25 @@ def make_pose_graph_page(graph: Graph) -> Page:
                 "times too large. Gate and robust optimisation therefore divide the information "
                 "matrices by this factor."
             )
-        elif chi2 > expected_high:
+        elif chi2 > max_expected_chi2:
             cause_text = (
                 "χ² is too large. Possible causes: false closures, or information matrices "
                 "that are too large."
             )
-        elif chi2 < expected_low:
+        elif chi2 < min_expected_chi2:
             cause_text = (
                 "The information matrices are too small, so the gate may accept false closures."
             )
-        page.write_labelled(
+        page.write_labelled_text(
             "Fit",
             f"χ² per degree of freedom {format_number(chi2)} (expected "
-            f"{format_number(expected_low)} to {format_number(expected_high)}, 95 %). {cause_text}",
+            f"{format_number(min_expected_chi2)} to {format_number(max_expected_chi2)}, 95 %). "
+            f"{cause_text}",
         )
     if isinstance(gates, Unavailable):
-        page.write_labelled("Gate", f"not applied: {gates.reason}")
+        page.write_labelled_text("Gate", f"not applied: {gates.reason}")
     elif not gates:
-        page.write_labelled("Gate", "the graph has no loop closures to test")
+        page.write_labelled_text("Gate", "the graph has no loop closures to test")
     else:
         gate_texts = [
             f"{gate.first} – {gate.second}: d² {gate.d2:.1f}, p {gate.p:.2g}"
@@ -270,9 +272,9 @@ def make_pose_graph_page(graph: Graph) -> Page:
         ]
         count_text = f"{len(gate_texts)} of {len(gates)} loop closures rejected"
         rejected_closure_lines = join_first_names(gate_texts, MAX_LISTED_CLOSURES, "\n").split("\n")
-        page.write_labelled("Gate", count_text, *rejected_closure_lines)
+        page.write_labelled_text("Gate", count_text, *rejected_closure_lines)
         if len(gates) > MAX_GNC_CLOSURES and len(graph.solutions) == 1:
-            page.write_labelled(
+            page.write_labelled_text(
                 "Robust",
                 "not solved, because the graph has many loop closures. Add --robust to solve it.",
             )
@@ -280,9 +282,10 @@ def make_pose_graph_page(graph: Graph) -> Page:
         label = SOLUTION_LABELS[key]
         if not solution.converged:
             not_converged_text = f"not converged: {label}. The cost is not at its minimum."
-            page.write_labelled("Solver", not_converged_text)
+            page.write_labelled_text("Solver", not_converged_text)
         text = (
-            f"{capitalise_first(label)}: cost {solution.cost_initial:.6g} → {solution.cost:.6g} in "
+            f"{capitalise_first_letter(label)}: cost {solution.cost_initial:.6g} → "
+            f"{solution.cost:.6g} in "
             f"{format_count(solution.iterations, 'iteration')}"
         )
         if key != "all":

@@ -18,7 +18,7 @@ AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 # Minimum extent of a path along its second principal axis, divided by the largest extent
 MIN_EXTENT_RATIO_FOR_ROTATION = 1e-6
 # Minimum extent (m, RMS) of a path
-MIN_EXTENT_M = 1e-6
+MIN_PATH_EXTENT_M = 1e-6
 # Maximum residual (RMS) after a yaw alignment, divided by the horizontal motion (RMS)
 MAX_RESIDUAL_TO_MOTION_RATIO_FOR_YAW = 1.0
 # Maximum residual (RMS) after a rotation alignment, divided by the motion (RMS) perpendicular to
@@ -123,7 +123,7 @@ def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Trans
     s = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])  # Umeyama eq. 43
     estimate_variance_m2 = float((x * x).sum() / len(x))  # Umeyama eq. 36
     scale = 1.0
-    if with_scale and estimate_variance_m2 > MIN_EXTENT_M**2:  # avoid an infinite scale
+    if with_scale and estimate_variance_m2 > MIN_PATH_EXTENT_M**2:  # avoid an infinite scale
         scale = float(d @ s / estimate_variance_m2)  # Umeyama eq. 42
     rotation = Rotation.from_matrix((u * s) @ vt)  # Umeyama eq. 40
     return _make_transform(rotation, estimate_m, reference_m, scale, 7 if with_scale else 6)
@@ -177,7 +177,7 @@ def _require_sufficient_motion(
         remedy = "Set `alignment` to yaw or none."
     residual_m = compute_rms_length_m(residuals_m)
     if (
-        extent_m < max(MIN_EXTENT_M, MIN_EXTENT_RATIO_FOR_ROTATION * max_extent_m)
+        extent_m < max(MIN_PATH_EXTENT_M, MIN_EXTENT_RATIO_FOR_ROTATION * max_extent_m)
         or residual_m > max_residual_ratio * extent_m
     ):
         raise TrajectoryError(

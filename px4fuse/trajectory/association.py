@@ -13,14 +13,14 @@ from px4fuse.core.arrays import (
     compute_median_interval_s,
     interpolate_columns,
 )
-from px4fuse.core.record import Count, NotNegative, Record
+from px4fuse.core.record import Count, NonNegativeFloat, Record
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
 AssociationMethod = Literal["interpolate", "nearest"]
 
 # Default maximum gap in the reference for interpolation, in median pose intervals
-MAX_GAP_INTERVALS = 3.0
+MAX_GAP_IN_MEDIAN_INTERVALS = 3.0
 # A reference with a longer mean pose interval (s) is not interpolated
 MIN_SPARSE_POSE_INTERVAL_S = 2.0
 # Lower limit (s) of the default maximum gap for interpolation
@@ -46,7 +46,7 @@ class Association(Record):
 
     method: AssociationMethod
     poses: Count
-    max_gap_s: NotNegative
+    max_gap_s: NonNegativeFloat
     outside: Count
     in_gaps: Count
     coverage_estimate: float
@@ -130,7 +130,7 @@ def associate(
 
 def choose_gap_limit_s(time_s: Array, min_gap_limit_s: float = MIN_GAP_LIMIT_S) -> float:
     """Return the default maximum gap (s) for the interpolation of poses."""
-    return max(MAX_GAP_INTERVALS * compute_median_interval_s(time_s), min_gap_limit_s)
+    return max(MAX_GAP_IN_MEDIAN_INTERVALS * compute_median_interval_s(time_s), min_gap_limit_s)
 
 
 def is_bracketed(time_s: Array, reference_time_s: Array, gap_limit_s: float) -> BoolArray:

@@ -16,7 +16,7 @@ import numpy as np
 
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.core.record import NOT_IN_JSON, NotInJson, OrUnavailable, Record
-from px4fuse.core.text import capitalise_first, format_metres
+from px4fuse.core.text import capitalise_first_letter, format_metres
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.alignment import (
@@ -29,12 +29,12 @@ from px4fuse.trajectory.alignment import (
 from px4fuse.trajectory.association import Association, AssociationMethod, associate
 from px4fuse.trajectory.model import Trajectory, compute_extent_m, cumulative_distance
 from px4fuse.trajectory.scores import (
-    RelativeError,
+    RelativePoseError,
     RmseInterval,
     RpePairDistance,
     Statistics,
     choose_default_deltas,
-    compute_relative_error,
+    compute_relative_pose_error,
     compute_rotation_statistics,
     compute_statistics,
     estimate_rmse_interval,
@@ -49,7 +49,7 @@ MIN_POSE_COUNT_TO_TEST_CONSTANT_ORIENTATION, MIN_EXTENT_TO_TEST_CONSTANT_ORIENTA
 # Minimum duration (s) of a repeated position, and minimum motion (m) of the reference meanwhile
 MIN_FREEZE_DURATION_S, MIN_REFERENCE_MOTION_DURING_FREEZE_M = 2.0, 0.5
 # Minimum jump (m) relative to the reference, and its minimum ratio to the median step error
-MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_RATIO = 0.5, 20.0
+MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_STEP_ERROR_RATIO = 0.5, 20.0
 MAX_STATED_JUMPS = 5
 # Minimum rotation (rad) between the orientations of two trajectories with different body axes
 MIN_ROTATION_BETWEEN_BODY_AXES_RAD = np.radians(30.0)
@@ -109,7 +109,7 @@ def find_jump_warnings(estimate: Trajectory, reference: Trajectory) -> tuple[str
     )
     step_differences_m = steps_of_estimate_m - steps_of_reference_m
     median_difference_m = np.median(np.abs(step_differences_m))
-    min_jump_m = max(MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_RATIO * median_difference_m)
+    min_jump_m = max(MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_STEP_ERROR_RATIO * median_difference_m)
     jump_indices = np.flatnonzero(step_differences_m > min_jump_m)
     if not len(jump_indices):
         return ()
@@ -139,7 +139,7 @@ def has_other_body_axes(aligned_estimate: Trajectory, reference: Trajectory) -> 
 # Maximum deviation of the estimated scale factor from 1 without a warning
 MAX_SCALE_ERROR = 0.1
 # Minimum fraction of poses or time that is evaluated, without a warning
-MIN_EVALUATED_FRACTION = 0.5
+MIN_EVALUATED_TRAJECTORY_FRACTION = 0.5
 # Minimum time offset (s) for a warning, because estimators can have smaller delays
 MIN_REPORTED_TIME_OFFSET_S = 0.1
 # A frame is mirrored if reversing one axis reduces the ATE to this fraction or less
@@ -158,7 +158,7 @@ _KINDS_WITHOUT_KNOWN_VERTICAL = ("slam", "unknown")
 _MONOCULAR_PATTERN = re.compile(r"(?<![a-z])mono(?![a-z])|monocular", re.IGNORECASE)
 
 
-class AbsoluteError(Record):
+class AbsoluteTrajectoryError(Record):
     """Absolute trajectory error (ATE): position (m) and orientation (degrees)."""
 
     translation_m: Statistics
@@ -200,8 +200,8 @@ class Evaluation(Record, kw_only=True):
     transform: Transform
     association: Association
     time_offset: TimeOffset
-    ate: AbsoluteError
-    rpe: tuple[RelativeError, ...]
+    ate: AbsoluteTrajectoryError
+    rpe: tuple[RelativePoseError, ...]
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
     estimate_track: NotInJson[Trajectory] = NOT_IN_JSON
@@ -278,7 +278,8 @@ def evaluate(
             raise
         transform = fit_positions(requires_motion=False)
         warnings.append(
-            f"{capitalise_first(error.reason)}. The ATE may be too small, and rotation errors may "
+            f"{capitalise_first_letter(error.reason)}. The ATE may be too small, and rotation "
+            "errors may "
             "be wrong."
         )
     # 3. Convert the orientations of the estimate to the body axes of the reference
@@ -329,7 +330,7 @@ def evaluate(
         transform=transform,
         association=association_result,
         time_offset=time_offset,
-        ate=AbsoluteError(
+        ate=AbsoluteTrajectoryError(
             position_statistics,
             estimate_rmse_interval(position_error_m, "ATE"),
             rotations
@@ -337,7 +338,9 @@ def evaluate(
             else compute_rotation_statistics(*rotations),
         ),
         rpe=tuple(
-            compute_relative_error(aligned_estimate, matched_reference, delta, all_pairs=all_pairs)
+            compute_relative_pose_error(
+                aligned_estimate, matched_reference, delta, all_pairs=all_pairs
+            )
             for delta in rpe_deltas
         ),
         time_s=matched_estimate.time_s,
@@ -504,12 +507,12 @@ def _find_comparison_warnings(
     *,
     has_jumps: bool,
 ) -> Iterator[str]:
-    if association.coverage_estimate < MIN_EVALUATED_FRACTION:
+    if association.coverage_estimate < MIN_EVALUATED_TRAJECTORY_FRACTION:
         yield (
             f"Only {association.coverage_estimate:.0%} of the estimate is evaluated; the reference "
             "has no poses at the other times."
         )
-    if association.coverage_reference < MIN_EVALUATED_FRACTION:
+    if association.coverage_reference < MIN_EVALUATED_TRAJECTORY_FRACTION:
         yield (
             f"The estimate covers only {association.coverage_reference:.0%} of the reference's "
             "duration."
@@ -518,8 +521,8 @@ def _find_comparison_warnings(
         return
     # Unlike fit_alignment, umeyama also returns the scale for motion along a line
     scale = umeyama(estimate.position_m, reference.position_m, with_scale=True).scale
-    has_motion = np.ptp(reference.position_m, axis=0).any()
-    if alignment != "sim3" and has_motion and abs(scale - 1.0) > MAX_SCALE_ERROR:
+    does_reference_move = np.ptp(reference.position_m, axis=0).any()
+    if alignment != "sim3" and does_reference_move and abs(scale - 1.0) > MAX_SCALE_ERROR:
         yield (
             f"The scale factor of the estimate is {scale:.3g} instead of 1, which the alignment "
             f"{alignment} does not correct."

@@ -230,11 +230,11 @@ def _find_candidate_offsets_s(sparse_track: Trajectory, dense_track: Trajectory)
     shorter_duration_s = min(float(np.ptp(track.time_s)) for track in (sparse_track, dense_track))
     if shorter_duration_s < 10 * step_s:
         return []
-    sparse_speeds, is_sparse_speed_known = _compute_speeds(sparse_track, step_s)
-    dense_speeds, is_dense_speed_known = _compute_speeds(dense_track, step_s)
+    sparse_track_speeds, is_sparse_speed_known = _compute_speeds(sparse_track, step_s)
+    dense_track_speeds, is_dense_speed_known = _compute_speeds(dense_track, step_s)
     correlations = []
     # If a trajectory has no orientations, only the speeds are correlated, and no angular speeds
-    for sparse_values, dense_values in zip(sparse_speeds, dense_speeds, strict=False):
+    for sparse_values, dense_values in zip(sparse_track_speeds, dense_track_speeds, strict=False):
         moments = compute_moments(
             sparse_values, dense_values, is_sparse_speed_known, is_dense_speed_known
         )
@@ -247,8 +247,8 @@ def _find_candidate_offsets_s(sparse_track: Trajectory, dense_track: Trajectory)
         ):
             mean_square = np.var(values[is_known]) * np.mean(is_known)
             is_usable &= square_sum > 1e-3 * mean_square * moments.count
-        square_product = moments.sum_of_squares_a * moments.sum_of_squares_b
-        scale = np.sqrt(np.where(is_usable, square_product, np.inf))
+        product_of_square_sums = moments.sum_of_squares_a * moments.sum_of_squares_b
+        scale = np.sqrt(np.where(is_usable, product_of_square_sums, np.inf))
         correlations.append(moments.covariance.real / scale)
     correlation = np.mean(correlations, axis=0)
     sliding_maximum = maximum_filter1d(
@@ -341,8 +341,12 @@ def _compute_interval_half_width_s(
         pose_count // 4,
     )
     lag_weights = 1.0 - np.arange(1, lag_count + 1) / (lag_count + 1.0)
-    variance_if_uncorrelated, *lagged_products = autocovariance(likelihood_score)[: lag_count + 1]
-    score_variance = variance_if_uncorrelated + max(2.0 * (lag_weights @ lagged_products), 0.0)
+    variance_if_uncorrelated, *lagged_autocovariances = autocovariance(likelihood_score)[
+        : lag_count + 1
+    ]
+    score_variance = variance_if_uncorrelated + max(
+        2.0 * (lag_weights @ lagged_autocovariances), 0.0
+    )
     student_t_quantile = float(stdtrit(max(pose_count / lag_count - 1.0, 1.0), 0.975))
     return float(student_t_quantile * np.sqrt(score_variance) / dense_track_square_sum)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from px4fuse.classroom.assignment.figures import draw_figures, select_choices
+from px4fuse.classroom.assignment.figures import draw_figures, make_choice_questions
 from px4fuse.classroom.assignment.key import (
     AnswerKey,
     CorrectAnswers,
@@ -49,9 +49,9 @@ def simulate_assigned_flight(
     log = flights.to_ulog(simulation, is_assessed=True)
     sha256 = hashlib.sha256(log).hexdigest()
     true_values = flights.compute_true_values(simulation)
-    form_answers = replace(
+    right_form_answers = replace(
         compute_form_answers(simulation, sha256),
-        choices=select_choices(partial(draw_uniform, secret, student.student_id, kind)),
+        choices=make_choice_questions(partial(draw_uniform, secret, student.student_id, kind)),
     )
     return log, CorrectAnswers(
         student_id=student.student_id,
@@ -65,7 +65,7 @@ def simulate_assigned_flight(
             name: value for name, value in true_values.items() if isinstance(value, float)
         },
         difficulty=assigned_flight.difficulty,
-        form=form_answers,
+        form=right_form_answers,
     )
 
 

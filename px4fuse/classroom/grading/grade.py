@@ -23,7 +23,7 @@ from px4fuse.classroom.grading.outputs import (
 )
 from px4fuse.classroom.grading.rubric import Rubric, grade_unreadable_file, score_report
 from px4fuse.core.reading import hash_files, max_log_bytes
-from px4fuse.core.text import one_line
+from px4fuse.core.text import shorten_to_line
 from px4fuse.core.workers import JobFailure, run_with_limits
 from px4fuse.core.writing import write_output_files
 from px4fuse.errors import ResultsError
@@ -97,7 +97,7 @@ def grade(
     for worksheet in course.worksheets:
         find_grade_column(worksheet, course.grade_column_title)
     unread_file_notes = [
-        f"{one_line(file.name, 80)} was ignored: px4fuse reads only {OVERRIDES_NAME}."
+        f"{shorten_to_line(file.name, 80)} was ignored: px4fuse reads only {OVERRIDES_NAME}."
         for file in sorted(output.glob("overrides*"))
         if file.name != OVERRIDES_NAME
     ]

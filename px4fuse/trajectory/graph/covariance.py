@@ -4,7 +4,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array, IntArray
-from px4fuse.core.record import Count, NotNegative, Record, Share
+from px4fuse.core.record import Count, NonNegativeFloat, Record, Share
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie, model
 
@@ -33,7 +33,7 @@ class GateResult(Record):
 
     first: int
     second: int
-    d2: NotNegative
+    d2: NonNegativeFloat
     degrees_of_freedom: Count
     p: Share
     accepted: bool

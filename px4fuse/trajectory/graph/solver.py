@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import chdtri, gammaincinv
 
 from px4fuse.core.arrays import Array, BoolArray
-from px4fuse.core.record import NOT_IN_JSON, Count, NotInJson, NotNegative, Record
+from px4fuse.core.record import NOT_IN_JSON, Count, NonNegativeFloat, NotInJson, Record
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.graph import lie, model
@@ -30,7 +30,7 @@ MAX_ITERATIONS = 100
 # Initial damping of Levenberg-Marquardt, as in GTSAM
 _INITIAL_DAMPING = 1e-5
 # Factor on the damping after a rejected step, as in GTSAM
-_DAMPING_FACTOR = 10.0
+_DAMPING_CHANGE_FACTOR = 10.0
 # Maximum damping of Levenberg-Marquardt, as in GTSAM
 _MAX_DAMPING = 1e5
 # Minimum ratio of actual to predicted cost decrease of an accepted step, as in GTSAM
@@ -65,9 +65,9 @@ class Solution(Record, kw_only=True):
     """Optimised poses of a pose graph, with cost and convergence."""
 
     # Half of the sum of the squared Mahalanobis distances before the optimisation
-    cost_initial: NotNegative
+    cost_initial: NonNegativeFloat
     # Half of the weighted sum of the squared Mahalanobis distances after the optimisation
-    cost: NotNegative
+    cost: NonNegativeFloat
     # Number of accepted Levenberg-Marquardt steps
     iterations: Count
     # True if the optimisation reached the cost tolerance
@@ -172,13 +172,13 @@ def _minimise(
                     break
             if damping >= _MAX_DAMPING:
                 return _Optimum(residuals, iterations, False)
-            damping *= _DAMPING_FACTOR
+            damping *= _DAMPING_CHANGE_FACTOR
         if not is_accepted:
             return _Optimum(residuals, iterations, True)
         residuals = trial_residuals
         cost -= cost_decrease
         iterations += 1
-        damping /= _DAMPING_FACTOR
+        damping /= _DAMPING_CHANGE_FACTOR
         if is_converged or cost_decrease <= _COST_TOLERANCE:
             return _Optimum(residuals, iterations, True)
     return _Optimum(residuals, iterations, cost <= _COST_TOLERANCE)
@@ -235,9 +235,9 @@ def _run_gnc(
     residuals = start_residuals
     iteration_count = 0
     # Initial control parameter: the inverse of the maximum over all edges (Yang 2020, section V)
-    inverse_control_by_edge = 2.0 * residuals.chi2 / chi2_bound - 1.0
-    if np.max(inverse_control_by_edge) > 0.0:
-        control_parameter = 1.0 / float(np.max(inverse_control_by_edge))
+    inverse_control_parameter_by_edge = 2.0 * residuals.chi2 / chi2_bound - 1.0
+    if np.max(inverse_control_parameter_by_edge) > 0.0:
+        control_parameter = 1.0 / float(np.max(inverse_control_parameter_by_edge))
         for _ in range(_MAX_GNC_STAGES):
             # avoid a division by zero
             chi2_ratio = np.maximum(residuals.chi2 / chi2_bound, 1e-200)
@@ -293,9 +293,9 @@ class Graph(Record, kw_only=True):
     poses: Count
     edges: Count
     initialised: str
-    reduced_chi2: NotNegative
-    reduced_chi2_interval: tuple[NotNegative, NotNegative]
-    information_factor: NotNegative
+    reduced_chi2: NonNegativeFloat
+    reduced_chi2_interval: tuple[NonNegativeFloat, NonNegativeFloat]
+    information_factor: NonNegativeFloat
     gates: tuple[GateResult, ...] | Unavailable
     solutions: Mapping[str, Solution]
 
