@@ -236,7 +236,7 @@ def test_fill_grades_changes_only_grade_and_feedback(
     if text is MOODLE:
         assert people[0][feedback] == "Points 87.5<br>&nbsp;&nbsp;&lt;b&gt;=1+1&lt;/b&gt;"
     if text is not BLACKBOARD:
-        assert any("above the maximum of 100 on the platform" in note for note in notes)
+        assert any("above the maximum of 100 in the table" in note for note in notes)
 
 
 def test_fill_grades_matches_anonymous_row_by_participant_number(tmp_path) -> None:

@@ -3,7 +3,6 @@
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
@@ -27,12 +26,12 @@ CHECK_LOG_REMEDY = "Check the logged data."
 T = TypeVar("T", bound=msgspec.Struct)
 
 
-@dataclass(eq=False)
 class _OutOfBoundsError(Exception):
     """Number in results outside its valid range."""
 
-    path: str
-    reason: str
+    def __init__(self, path: str, reason: str) -> None:
+        super().__init__(reason)
+        self.path, self.reason = path, reason
 
 
 def find_field_bounds(name: str) -> tuple[float, float]:
@@ -110,7 +109,7 @@ def _drop_invalid_values(
         for unavailable_type in list_types(annotation):
             if isinstance(unavailable_type, type) and issubclass(unavailable_type, Unavailable):
                 text_fields = {"what": path, "reason": error.reason, "remedy": CHECK_LOG_REMEDY}
-                # for example the truth errors of a filter, if its NIS is not valid
+                # for example the errors of a filter against ground truth, if its NIS is not valid
                 other_fields = {
                     field.name: _drop_invalid_values(
                         getattr(value, field.name), field.type, path, errors

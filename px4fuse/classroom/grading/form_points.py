@@ -285,7 +285,7 @@ def _score_faults(matches: list[FaultMatch], right_answers: CorrectFormAnswers) 
         if named_fault is None:
             continue
         size_score = score_fault_size(fault, named_fault)
-        # time, plot and correction of a guessable fault are easy: they need the right size
+        # time, plot and correction of a guessable fault are easy: they need the correct size
         fault_weight = (size_score if fault.kind in GUESSABLE_FAULT_KINDS else 1.0) / len(matches)
         # time and plot of a similar fault give half of the points
         evidence_weight = fault_weight if named_fault.kind == fault.kind else 0.5 * fault_weight
@@ -302,7 +302,7 @@ def score_fault_size(fault: InjectedFault, named_fault: NamedFault) -> float:
     if fault.size is None or fault.low is None or fault.high is None or stated_size is None:
         return 0.0
     if named_fault.kind != fault.kind:
-        # the right size of a similar fault, such as a time offset, gives a third of the points
+        # the correct size of a similar fault, such as a time offset, gives a third of the points
         unit, named_unit = (FAULT_KINDS[each.kind].standard_unit for each in (fault, named_fault))
         return (fault.low <= stated_size <= fault.high and unit == named_unit) / 3.0
     relative_error = abs(stated_size - fault.size) / abs(fault.size)
