@@ -126,7 +126,7 @@ WEAK = np.array([1e-6, 1e-4])  # prior precision of position and velocity
 WEIGHT = np.random.default_rng(2).uniform(0.1, 1.0, COUNT)
 SOME_NOISES = [
     NoiseParameters(0.5, 0.1), NoiseParameters(0.05, 0.1), NoiseParameters(2.0, 0.1),
-    NoiseParameters(0.5, 0.02), NoiseParameters(0.5, 1.0), NoiseParameters(0.5, 0.1, 0.3),
+    NoiseParameters(0.5, 0.02), NoiseParameters(0.5, 4.0), NoiseParameters(0.5, 0.1, 0.3),
     NoiseParameters(0.5, 0.1, 0.0, 0.3, 0.7), NoiseParameters(0.5, 0.1, 0.3, 0.05, 3.0),
 ]  # fmt: skip
 

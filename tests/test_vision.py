@@ -558,8 +558,10 @@ def test_ekf2_model_excludes_vision_that_disagrees_with_log(wrong: dict[str, Any
     assert not found.agreement.good
     assert found.inputs.vision_positions is None
     assert "ev_pos" not in list_modelled_aids(found.inputs)
+    # the message names the first of several parameters without effect
+    change = {"EKF2_EVP_NOISE": 0.3, "EKF2_EVP_GATE": 5.0, "EKF2_EV_DELAY": 0.0}
     with pytest.raises(SettingsError, match="EKF2_EVP_NOISE has no effect in a replay of this log"):
-        list(replay_with_settings(found, [{"EKF2_EVP_NOISE": 0.3}]))
+        list(replay_with_settings(found, [change, {"EKF2_EV_POS_X": 0.1}]))
 
 
 def test_ekf2_model_does_not_fuse_vision_while_disabled() -> None:

@@ -289,11 +289,12 @@ def _compute_imu_process_noise(
 ) -> tuple[Array, Array]:
     """Return the process noise for unit gyro noise, and for unit accelerometer noise.
 
-    The specific force is assumed to be constant in an interval of n steps of length d. Noise that
-    acts k steps before the end of the interval changes the attitude by d, the velocity by k m d
-    (gyro) or d (accelerometer), and the position by k (k - 1) m d² / 2 or k d².
-    The blocks are sums of products of these changes over all k. For the effect of gyro noise on
-    the position, some sums are replaced by their leading terms.
+    The specific force is assumed to be constant in an interval of n steps of length d. In one step,
+    an attitude error changes the velocity by m per rad. Noise that acts k steps before the end of
+    the interval changes the attitude by d, the velocity by k m d (gyro) or d (accelerometer), and
+    the position by k (k - 1) m d² / 2 or k d². The blocks are sums of products of these changes
+    over all k. For the effect of gyro noise on the position, some sums are replaced by their
+    leading terms.
     """
     n = np.maximum(prediction_step_counts, 1.0)[:, None, None]
     d = duration_s[:, None, None] / n

@@ -203,7 +203,8 @@ def replay_with_settings(
         Unknown parameter or aiding source, or a value outside PX4's range.
     """
     changes = [check_parameters(change) for change in settings]
-    _check_replayed_names(model, set().union(*changes), disable_time_s_by_aid)
+    changed_names = (name for change in changes for name in change)
+    _check_replayed_names(model, changed_names, disable_time_s_by_aid)
     if excluded_times_s is not None:
         model = _exclude_samples(model, excluded_times_s)
     inputs = model.inputs

@@ -339,7 +339,10 @@ def _mark_unpredictable_statistics(
 
 
 def _has_few_rejections(summary: Ekf2Statistics) -> bool:
-    """Return True if the model can predict EKF2's rejections; a replay of the log is exempt."""
+    """Return True if EKF2 rejects so few samples that the model can predict the rejections.
+
+    The rejected positions of a replay with the logged parameters are not counted.
+    """
     rejected_fractions = [aid.rejected_fraction for aid in summary.others.values()]
     if summary.changed:
         rejected_fractions.append(summary.rejected_fraction)

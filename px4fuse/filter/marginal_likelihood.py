@@ -272,24 +272,28 @@ def fit_positions(
     ):
         log_determinant += len(axes) * system.log_determinant
         degrees_of_freedom += len(axes) * axis_degrees_of_freedom
-        measured_axes_m, increments = measured_m[axes], (dp[axes], dv[axes])
-        weighted_increments = system.weight_increments(*increments)
-        whitened_explained_part = system.whiten_explained_part(
-            measured_axes_m, *weighted_increments
-        )
-        # Inner product of two inputs: ΔᵀQ⁻¹Δ of the increments Δ, plus zᵀR⁻¹z of the positions z
-        # (below), minus the part that the estimated states explain
-        for sign, left, right, values_per_measurement in (
-            (1.0, increments[0], weighted_increments[0], 1),
-            (1.0, increments[1], weighted_increments[1], 1),
-            (-1.0, whitened_explained_part, whitened_explained_part, system.state_count),
-        ):
-            gram_matrix += sign * _compute_inner_products(
-                left, right, values_per_measurement * segment_edges
+        # One axis after the other: twice as fast in a long flight, because the arrays are smaller
+        for rows in (slice(axis, axis + 1) for axis in axes):
+            measured_axis_m, increments = measured_m[rows], (dp[rows], dv[rows])
+            weighted_increments = system.weight_increments(*increments)
+            whitened_explained_part = system.whiten_explained_part(
+                measured_axis_m, *weighted_increments
             )
-        gram_matrix[..., :measured_input_count, :measured_input_count] += _compute_inner_products(
-            system.precision[:, 0] * measured_axes_m, measured_axes_m, segment_edges
-        )
+            # Inner product of two inputs: ΔᵀQ⁻¹Δ of the increments Δ, plus zᵀR⁻¹z of the positions
+            # z (below), minus the part that the estimated states explain
+            for sign, left, right, values_per_measurement in (
+                (1.0, increments[0], weighted_increments[0], 1),
+                (1.0, increments[1], weighted_increments[1], 1),
+                (-1.0, whitened_explained_part, whitened_explained_part, system.state_count),
+            ):
+                gram_matrix += sign * _compute_inner_products(
+                    left, right, values_per_measurement * segment_edges
+                )
+            gram_matrix[..., :measured_input_count, :measured_input_count] += (
+                _compute_inner_products(
+                    system.precision[:, 0] * measured_axis_m, measured_axis_m, segment_edges
+                )
+            )
     return PositionFit(
         gram_matrix, log_determinant, degrees_of_freedom, positions.prior_sigmas_of_constant_errors
     )
