@@ -18,6 +18,7 @@ from px4fuse.core.arrays import (
     Array,
     ArrayPair,
     BoolArray,
+    IntArray,
     cumulative_sums,
     select_intervals,
 )
@@ -73,6 +74,8 @@ MAX_HORIZON_DELAY_S = 1.0
 
 # Number of replays that are computed at once; limits the memory
 REPLAY_BATCH_SIZE = 10
+# Number of intervals between fusions whose states are computed at once; limits the memory
+EVENTS_PER_BLOCK = 512
 
 
 @dataclass(frozen=True)
@@ -518,17 +521,47 @@ def _make_state_tracks(
 def compute_delayed_states(run: SegmentRun, configuration_index: int) -> Array:
     """Return the state at the fusion horizon after each of n prediction steps.
 
-    The state has the shape (n + 1, 15) or more. Between the fusions, the IMU predicts attitude
-    error, velocity and position, and the biases are constant.
+    The state has the shape (n + 1, 15) or more.
     """
-    segment, step_s = run.segment, run.segment.step_s[:, None]
     event_states = run.state[:, configuration_index]
     event_steps = run.events[configuration_index].end_step
-    start_steps = np.append(0, event_steps)
-    interval_lengths = np.diff(start_steps, append=len(step_s))
-    states = np.concatenate([event_states[:1], np.repeat(event_states, interval_lengths, axis=0)])
-    # State at the end of each step; initially the state after the previous fusion
-    state = states[1:]
+    step_count = len(run.segment.step_s)
+    # First prediction step of the interval after each event, and end of the last interval
+    first_steps = np.concatenate([[0], event_steps, [step_count]])
+    states = np.empty((step_count + 1, event_states.shape[1]))
+    states[0] = event_states[0]
+    for first_event in range(0, len(event_states), EVENTS_PER_BLOCK):
+        block_first_steps = first_steps[first_event : first_event + EVENTS_PER_BLOCK + 1]
+        states[1:][block_first_steps[0] : block_first_steps[-1]] = _propagate_states(
+            run, configuration_index, event_states[first_event:], block_first_steps
+        )
+    states[event_steps] = event_states[1:]
+    return states
+
+
+def _propagate_states(
+    run: SegmentRun, configuration_index: int, event_states: Array, first_steps: IntArray
+) -> Array:
+    """Predict the state with the IMU from each fusion to the steps before the next fusion.
+
+    Parameters
+    ----------
+    event_states : ndarray, shape (intervals or more, states)
+        State at the start of each interval, after a fusion.
+    first_steps : ndarray of int, shape (intervals + 1,)
+        Index of the first step of each interval, and of the last step plus 1.
+
+    Returns
+    -------
+    ndarray, shape (steps, states)
+        State at the end of each step. The biases are constant between fusions.
+    """
+    segment, configuration = run.segment, run.configurations[configuration_index]
+    interval_lengths = np.diff(first_steps)
+    event_states = event_states[: len(interval_lengths)]
+    state = np.repeat(event_states, interval_lengths, axis=0)
+    steps = slice(first_steps[0], first_steps[-1])
+    body_to_ned, step_s = segment.body_to_ned[1:][steps], segment.step_s[steps, None]
 
     def integrate(rows: slice, increments: Array) -> ArrayPair:
         """Return the state elements ``rows`` before and after each prediction step.
@@ -537,24 +570,23 @@ def compute_delayed_states(run: SegmentRun, configuration_index: int) -> Array:
         then.
         """
         sums = cumulative_sums(increments)
-        offsets = np.repeat(event_states[:, rows] - sums[start_steps], interval_lengths, axis=0)
+        sums_at_events = sums[first_steps[:-1] - first_steps[0]]
+        offsets = np.repeat(event_states[:, rows] - sums_at_events, interval_lengths, axis=0)
         return sums[:-1] + offsets, sums[1:] + offsets
 
     # Prediction of attitude error, velocity and position, see intervals.py
-    body_to_ned = segment.body_to_ned[1:]
     rotation_increments_rad = -rotate(body_to_ned, state[:, GYRO_BIAS]) * step_s
-    if run.configurations[configuration_index].estimates_attitude:
-        rotation_increments_rad -= segment.attitude_correction_rad
-    attitude_error_before_step_rad, state[:, THETA] = integrate(THETA, rotation_increments_rad)
-    specific_force_ned_m_s2 = rotate(body_to_ned, segment.specific_force_m_s2)
+    if configuration.estimates_attitude:
+        rotation_increments_rad -= segment.attitude_correction_rad[steps]
+    attitude_error_before_rad, state[:, THETA] = integrate(THETA, rotation_increments_rad)
+    specific_force_ned_m_s2 = rotate(body_to_ned, segment.specific_force_m_s2[steps])
     acceleration = (
-        np.cross(attitude_error_before_step_rad, specific_force_ned_m_s2)
+        np.cross(attitude_error_before_rad, specific_force_ned_m_s2)
         + specific_force_ned_m_s2
         + GRAVITY_M_S2
     )
     acceleration -= rotate(body_to_ned, state[:, ACCELEROMETER_BIAS])
-    velocity_before_step_m_s, state[:, VELOCITY] = integrate(VELOCITY, acceleration * step_s)
-    mean_velocity_m_s = 0.5 * (velocity_before_step_m_s + state[:, VELOCITY])
+    velocity_before_m_s, state[:, VELOCITY] = integrate(VELOCITY, acceleration * step_s)
+    mean_velocity_m_s = 0.5 * (velocity_before_m_s + state[:, VELOCITY])
     state[:, POSITION] = integrate(POSITION, mean_velocity_m_s * step_s)[1]
-    states[event_steps] = event_states[1:]
-    return states
+    return state
