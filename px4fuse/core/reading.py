@@ -218,10 +218,16 @@ def list_files_recursively(folder: Path) -> list[Path]:
     A folder that cannot be listed is returned too, so that reading it raises an error.
     """
     files: list[Path] = []
-    folders = os.walk(folder, onerror=lambda error: files.append(Path(error.filename)))
-    for parent, subfolder_names, file_names in folders:
-        paths = [Path(parent, name) for name in (*subfolder_names, *file_names)]
-        files += [path for path in paths if path.is_symlink() or not path.is_dir()]
+    pending_folders = [folder]
+    while pending_folders:
+        folder_path = pending_folders.pop()
+        try:
+            with os.scandir(folder_path) as entries:
+                for entry in entries:
+                    target_paths = pending_folders if entry.is_dir(follow_symlinks=False) else files
+                    target_paths.append(Path(entry.path))
+        except OSError:
+            files.append(folder_path)
     return sorted(files)
 
 
