@@ -204,6 +204,7 @@ def test_align_position_file_recovers_clock_frame_and_yaw(
         np.testing.assert_allclose(alignment.origin_m, origin_m, atol=0.05)
     else:
         assert alignment.frame == {"ned": "ned"}.get(frame, "enu")
+        assert ("; nwu was not tested" in alignment.frame_reason) is (frame != "ned")
     assert_same_track(track, flight.positions[0], 0.1)
     assert clock_error_s(alignment, offset_s, (5e-4, 0.02)) < 0.03
     assert alignment.misplaced == alignment.warnings == ()

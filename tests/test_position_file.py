@@ -469,6 +469,8 @@ def test_read_position_file_names_missing_column_in_error(read):
     (table(PLAIN, decimal=","), "has 4 columns, but the rows have 8. Write numbers"),
     ("time,x,y,z\n" + table({"n": JUNK, **PLAIN}, header=False), "4 columns, but the rows have 5"),
     (table({**PLAIN, "time": ["12.5"] * ROWS}), "1 usable rows"),
+    ("9,1,2,3\n8,1,2,3\n" + "".join(f"{i},1,2,{i}\n" for i in range(8)),
+     "8 usable rows, fewer than 9;"),
 ])  # fmt: skip
 def test_read_position_file_of_unreadable_file_raises_log_error(read, content, words):
     line = error_message(read, content)

@@ -12,7 +12,13 @@ from conftest import REPOSITORY
 from time_limit import time_limit
 
 from px4fuse.core import workers
-from px4fuse.core.reading import display_name, max_log_bytes, read_bytes_limited, read_text
+from px4fuse.core.reading import (
+    display_name,
+    list_files_recursively,
+    max_log_bytes,
+    read_bytes_limited,
+    read_text,
+)
 from px4fuse.errors import LogError, Px4FuseError
 from px4fuse.verification.model import Verification
 from px4fuse.verification.verification import log_sha256
@@ -177,3 +183,18 @@ def test_command_with_folder_as_input_file_names_the_folder(
 def test_error_message_with_line_feeds_becomes_one_line() -> None:
     assert str(Px4FuseError("a\r\nb c\td\x00\ud800")) == "a  b c d??"
     assert display_name(Path("logs") / "σ.ulg") == "σ.ulg"
+
+
+def test_files_of_folder_that_cannot_be_entered_are_listed(tmp_path, monkeypatch):
+    (tmp_path / "closed" / "subfolder").mkdir(parents=True)
+    file = tmp_path / "closed" / "uwb.csv"
+    file.touch()
+
+    def refuse(path, *_, **__):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    with monkeypatch.context() as patch:  # as for a folder that can be listed, but not entered
+        patch.setattr(os, "stat", refuse)
+        patch.setattr(os, "lstat", refuse)
+        files = list_files_recursively(tmp_path)
+    assert files == [file]

@@ -128,6 +128,16 @@ def test_constant_coordinate_is_reported_and_not_fused(column, name, severity, c
     assert ("down" in comparison.axes) is (column != "down_m")
 
 
+def test_source_with_three_constant_coordinates_is_not_fused():
+    flight = simulate_flight(Scenario(passes=1, seed=2))
+    flight = replace(flight, log=replace(flight.log, parameters={"EKF2_EV_CTRL": 15}))
+    samples = flight.positions[0].samples.assign(north_m=1.0, east_m=1.0, down_m=1.0)
+    source = replace(flight.positions[0], samples=samples)
+    comparison = compare(replace(flight, positions=(source,)))
+    (found,) = source_positions.detect_constant_coordinates(comparison)
+    assert "Set EKF2_EV_CTRL to 12," in found.remedy
+
+
 @pytest.mark.parametrize(("stamp", "clock"), [
     (lambda us: us // 1000, "milliseconds"),
     (lambda us: us // 1_000_000, "seconds"),

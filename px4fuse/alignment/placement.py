@@ -173,9 +173,11 @@ def align_position_file(
     if frame:
         frame_reason = "the frame was given with --position-frame"
     elif match and len(problem.frames) != 1:
+        is_nwu_possible = yaw_rad is None and match.frame == "enu"
         frame_reason = (
             f"{match.frame} is the tested frame with the smallest residual against the "
             f"{match.reference.name} ({match.residuals_text})"
+            f"{'; nwu was not tested, because it is enu with another yaw' * is_nwu_possible}"
         )
     elif recording.format:
         frame_reason = f"the format {recording.format} defines the frame"

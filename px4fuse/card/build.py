@@ -55,7 +55,7 @@ from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
 from px4fuse.filter.signals import AISLE_AXIS
 from px4fuse.finding import Finding
-from px4fuse.findings.model import format_count, format_percent, split_cause_groups
+from px4fuse.findings.model import format_occurrences, format_percent, split_cause_groups
 from px4fuse.findings.source_positions import has_little_motion
 from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
 from px4fuse.flight.model import Ekf2, LogInfo, Unavailable
@@ -330,7 +330,7 @@ def _describe_effect(
     if rejected_fraction >= MIN_REPORTED_REJECTED_FRACTION:
         sentences.append(f"EKF2 rejected {format_percent(rejected_fraction)} of the positions.")
     if effect.horizontal_resets:
-        count_text = format_count(effect.horizontal_resets)
+        count_text = format_occurrences(effect.horizontal_resets)
         sentences.append(f"EKF2 reset its horizontal position {count_text}.")
     return " ".join(sentences)
 

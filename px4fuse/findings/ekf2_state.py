@@ -19,7 +19,7 @@ from px4fuse.findings.model import (
     compute_flag_fraction,
     find_spans_with_value,
     finding,
-    format_count,
+    format_occurrences,
     format_percent,
     magnetometer_advice,
     make_error,
@@ -266,7 +266,8 @@ def detect_resets(analysis: Analysis, ekf2: Ekf2) -> Findings:
             "warning" if horizontal_resets else "note",
             "ekf2_resets",
             f"EKF2 reset its {'horizontal position' if horizontal_resets else 'height'} "
-            f"{format_count(len(resets))} (largest reset: {largest_m:.2f} m at {time_s:.1f} s).",
+            f"{format_occurrences(len(resets))} (largest reset: {largest_m:.2f} m at {time_s:.1f} "
+            "s).",
             f"Run px4fuse explore LOG and compare position and innovation at {time_s:.1f} s.",
             {
                 "count": len(resets),
@@ -286,8 +287,8 @@ def detect_instance_switches(ekf2: Ekf2, segment: Segment) -> Findings:
     if switch_times_s:
         yield make_warning(
             "ekf2_instance_switch",
-            f"The primary EKF2 instance changed {format_count(len(switch_times_s))}, first at "
-            f"{switch_times_s[0]:.1f} s. The comparison uses the primary instance at each time.",
+            f"The primary EKF2 instance changed {format_occurrences(len(switch_times_s))}, first "
+            f"at {switch_times_s[0]:.1f} s. The comparison uses the primary instance at each time.",
             "Compare vibration and clipping of the IMUs (vehicle_imu_status). For a lab flight set "
             "EKF2_MULTI_IMU to 1: EKF2 then uses one IMU.",
             {"count": len(switch_times_s), "at_s": switch_times_s[0]},

@@ -249,7 +249,7 @@ def lower_severity(severity: Severity) -> Severity:
     return "warning" if severity == "error" else "note"
 
 
-def format_count(count: int) -> str:
+def format_occurrences(count: int) -> str:
     return "once" if count == 1 else f"{count} times"
 
 

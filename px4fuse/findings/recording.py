@@ -6,7 +6,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.text import capitalise_first_letter, format_number
 from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
-from px4fuse.findings.model import Findings, format_count, make_note, make_warning
+from px4fuse.findings.model import Findings, format_occurrences, make_note, make_warning
 from px4fuse.flight.model import AS_RECEIVED_ORIGIN, Ekf2, Flight, Unavailable
 
 VISION_TOPIC = "vehicle_visual_odometry"
@@ -83,16 +83,16 @@ def detect_backward_clock_jumps(flight: Flight) -> Findings:
     if log.restarts:
         yield make_warning(
             "autopilot_restarted",
-            f"The autopilot's boot clock restarted {format_count(log.restarts)}. px4fuse reads "
-            "only the longest recording.",
+            f"The autopilot's boot clock restarted {format_occurrences(log.restarts)}. px4fuse "
+            "reads only the longest recording.",
             "Record each flight in a separate file.",
             {"count": log.restarts},
         )
     if reversals := log.receive_time_reversals:
         yield make_note(
             "receive_time_went_back",
-            f"The recorded receive time decreased {format_count(reversals)}. Possible cause: the "
-            "clock of the recording computer was set back, or the file consists of several "
+            f"The recorded receive time decreased {format_occurrences(reversals)}. Possible cause: "
+            "the clock of the recording computer was set back, or the file consists of several "
             "recordings.",
             "Do not synchronise the clock of the recording computer while recording.",
             {"count": reversals},

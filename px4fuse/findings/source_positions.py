@@ -250,8 +250,11 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
         constant_axes_mask, measured_axes_mask = EV_CTRL_HEIGHT_MASK, EV_CTRL_HORIZONTAL_MASK
     elif coordinates == ["x", "y"]:
         consequence = "Only the height is evaluated."
-    else:  # only x or only y
+    else:  # only x, only y, or all
         make_finding, consequence = make_error, NO_ESTIMATES_SENTENCE
+        if "z" in coordinates:
+            constant_axes_mask |= EV_CTRL_HEIGHT_MASK
+            measured_axes_mask = 0
     action, coordinates_text = "", " and ".join(coordinates)
     if EV_POS.switch in parameters:
         value = int(parameters[EV_POS.switch])

@@ -6,6 +6,7 @@ The positions keep the clock and the coordinate frame of the file.
 """
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -272,13 +273,11 @@ def _check_row_count(
 
     If many rows of a table without header are not usable, its first column is not the time.
     """
-    min_count = float(MIN_USABLE_ROWS)
+    min_count = MIN_USABLE_ROWS
     if table.format == HEADERLESS_TABLE_FORMAT:
-        min_count = max(min_count, MIN_MATCHING_ROW_FRACTION * row_count)
+        min_count = max(min_count, math.ceil(MIN_MATCHING_ROW_FRACTION * row_count))
     if usable_count < min_count:
-        fault = (
-            f"{table.file_name} contains {usable_count} usable rows, fewer than {MIN_USABLE_ROWS}"
-        )
+        fault = f"{table.file_name} contains {usable_count} usable rows, fewer than {min_count}"
         raise LogError(
             "; ".join((fault, *notes)),
             "Write numbers with decimal points. Alternatively, name the columns with "
