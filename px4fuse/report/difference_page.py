@@ -58,15 +58,11 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     )
     page.add_columns(left_column, right_column)
     difference_m = pd.Series(explanation.kf_minus_ekf2_m, explanation.times_s)
-    worst_row = int(np.argmax(np.abs(explanation.kf_minus_ekf2_m)))
     axes = add_time_panel(
         page,
         analysis,
         "Position difference KF - EKF2 (m): total (dark) and unexplained part (light)",
         TIME_PLOT_HEIGHT,
-        caption="Largest difference KF - EKF2: "
-        f"{abs(explanation.kf_minus_ekf2_m[worst_row]):.2g} m at "
-        f"{explanation.times_s[worst_row]:.1f} s.",
     )
     unexplained_difference_m = pd.Series(explanation.unexplained_difference_m, explanation.times_s)
     for start, end in explanation.spans_s:

@@ -76,12 +76,12 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
 def _write_page(page: Page, loop: Loop) -> None:
     page.write(_describe_closure_error(loop))
     _write_segment(page, loop)
-    missing_reasons = {
-        f"No {correction.what}: {correction.reason}": None
+    missing_reasons = (
+        f"No {correction.what}: {correction.reason}"
         for correction in loop.corrections.values()
         if isinstance(correction, Unavailable)
-    }
-    for reason in missing_reasons:
+    )
+    for reason in dict.fromkeys(missing_reasons):
         page.write_muted_text(reason)
     _write_ate(page, loop)
     axes = page.add_panel("Map in the frame of the odometry", MAP_HEIGHT)
