@@ -95,6 +95,7 @@ class Paragraph(NamedTuple):
     plot: str = ""
 
     def wrap(self, width: int) -> list[str]:
+        """Split the paragraph into lines; a paragraph with a plot is one line."""
         if self.wrap_indent is not None:
             lines = list[str]()
             for sentence in SENTENCE_END_PATTERN.split(self.text):
@@ -109,6 +110,7 @@ class Paragraph(NamedTuple):
             return lines
         if not self.plot or len(self.text) + len(self.plot) <= width:
             return [self.text + self.plot]
+        # too narrow for the plot
         return [self.text.rstrip()] if self.text.strip() else []
 
 
@@ -394,9 +396,10 @@ def _format_verdict_lines(card: Card) -> Iterator[Paragraph]:
     heading = f"Consistency{direction_text}: RMS of error ÷ reported σ (expected 1)"
     yield Paragraph(heading, "", "  ")
     legend = f"  ░ consistent ({format_consistent_ratios()})"
-    yield Paragraph(
-        f"{'':{AXIS_INDENT}}", plot=f"← reported σ too large{'too small →':>{AXIS_WIDTH - 14}}"
-    )
+    left_end, right_end = "← reported σ too large", "too small →"
+    # the plot has 8 more characters than its axis: the labels of the ends
+    right_end_width = AXIS_WIDTH + 8 - len(left_end)
+    yield Paragraph(f"{'':{AXIS_INDENT}}", plot=f"{left_end}{right_end:>{right_end_width}}")
     yield Paragraph(f"{legend:{AXIS_INDENT}}", plot=_format_tick_labels())
     if any(verdict.is_explained for verdict in card.verdicts):
         yield Paragraph("  Verdicts in brackets need no action.")
