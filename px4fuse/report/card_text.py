@@ -330,12 +330,6 @@ def _format_action_lines(label: str, label_width: int, action: Action) -> Iterat
 
 def _format_rerun_table(reruns: Sequence[CardRerun]) -> Iterator[Paragraph]:
     rows = make_rerun_rows(reruns)
-    for row in rows[1:]:
-        # Each cell begins with the first word or symbol of its heading
-        row[1:-1] = [
-            f"{heading.removeprefix('position ').split()[0]} {cell}" if cell else ""
-            for heading, cell in zip(rows[0][1:-1], row[1:-1], strict=True)
-        ]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))

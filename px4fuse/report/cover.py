@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,7 +22,7 @@ from px4fuse.comparison.comparison import (
     compute_position_errors,
     interpolate_sigma,
 )
-from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, select_north_and_east
+from px4fuse.comparison.model import FILTER_NAMES, select_north_and_east
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres, format_ratio, one_line
 from px4fuse.filter.consistency import Reference
@@ -57,7 +57,7 @@ from px4fuse.report.panels import (
     draw_dots,
     normalised_innovations,
 )
-from px4fuse.report.style import SEVERITY_COLOURS, TRACK_STYLES, Axes, draw_curve
+from px4fuse.report.style import SEVERITY_COLOURS, TRACK_STYLES, draw_curve
 from px4fuse.results.contract import AidsResults, ComparisonResults
 
 FlightResults = ComparisonResults | AidsResults
@@ -166,31 +166,19 @@ def _make_cause_fields(cause: DiagnosedCause) -> dict[str, Any]:
     return structs.asdict(cause) | formatted_fields
 
 
-class TimePlot(NamedTuple):
-    """Plot over time: title, and function that draws the plot."""
-
-    title: str
-    draw: Callable[[Axes], None]
-
-
 def write_panels(page: Page, analysis: Analysis, card: Card) -> None:
     """Draw map, position errors and innovations, together on the first or on the second page."""
     section, (left_column, right_column) = Page(), make_columns()
     add_legend(section, analysis)
     _draw_map(left_column, analysis)
-    plots = [*_make_error_plots(analysis, card), _make_innovation_plot(analysis.main)]
-    for plot in plots:
-        is_last = plot is plots[-1]
-        axes = add_time_panel(
-            right_column, analysis, plot.title, PLOT_HEIGHT, with_time_label=is_last
-        )
-        plot.draw(axes)
+    _draw_error_plots(right_column, analysis, card)
+    _draw_innovations(right_column, analysis)
     section.add_columns(left_column, right_column)
     page.add_columns(section)
 
 
-def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
-    """Return plots of the position errors of KF and EKF2, or of their difference."""
+def _draw_error_plots(page: Page, analysis: Analysis, card: Card) -> None:
+    """Draw the position errors of KF and EKF2, or their difference."""
     result, effect = analysis.main.with_whole_flight_tracks(), card.effect
     plots: list[tuple[str, float | None, pd.Series[float], SigmaByFilter]] = []
     for filter_name, label in FILTER_NAMES.items():
@@ -214,7 +202,8 @@ def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
         (_compute_error_axis_limit_m(error_m, sigmas_m) for _, _, error_m, sigmas_m in plots),
         default=0.0,
     )
-    return [_make_error_plot(*plot, half_range_m) for plot in plots]
+    for plot in plots:
+        _draw_error_plot(page, analysis, *plot, half_range_m)
 
 
 def _compute_error_axis_limit_m(error_m: pd.Series[float], sigmas_m: SigmaByFilter) -> float:
@@ -224,13 +213,15 @@ def _compute_error_axis_limit_m(error_m: pd.Series[float], sigmas_m: SigmaByFilt
     return float(np.nanmax([largest_error_m, *np.minimum(sigma_limits_m, 3.0 * largest_error_m)]))
 
 
-def _make_error_plot(
+def _draw_error_plot(
+    page: Page,
+    analysis: Analysis,
     title: str,
     rms_m: float | None,
     error_m: pd.Series[float],
     sigmas_m: SigmaByFilter,
     half_range_m: float,
-) -> TimePlot:
+) -> None:
     known_sigmas_m = {
         name: sigma.dropna() for name, sigma in sigmas_m.items() if sigma.notna().any()
     }
@@ -241,29 +232,24 @@ def _make_error_plot(
         title += f", median {label} {format_metres(sigma.median())}"
     line = style.line_style("black", 1.0) if is_difference else TRACK_STYLES[next(iter(sigmas_m))]
 
-    def draw(axes: Axes) -> None:
-        axes.set_ylim(-half_range_m, half_range_m)
-        for name, sigma in known_sigmas_m.items():
-            style.draw_sigma_band(axes, 0.0 * sigma, sigma, style.SIGMA_BAND_COLOURS[name])
-        style.draw_zero_line(axes)
-        draw_curve(axes, error_m, **line)
-
-    return TimePlot(title, draw)
+    axes = add_time_panel(page, analysis, title, PLOT_HEIGHT, with_time_label=False)
+    axes.set_ylim(-half_range_m, half_range_m)
+    for name, sigma in known_sigmas_m.items():
+        style.draw_sigma_band(axes, 0.0 * sigma, sigma, style.SIGMA_BAND_COLOURS[name])
+    style.draw_zero_line(axes)
+    draw_curve(axes, error_m, **line)
 
 
-def _make_innovation_plot(result: AxisComparison) -> TimePlot:
-    innovations = normalised_innovations(result)
+def _draw_innovations(page: Page, analysis: Analysis) -> None:
+    innovations = normalised_innovations(analysis.main)
     legend = ", ".join(f"{style.INNOVATION_SIGNS[name]} {name}" for name in innovations)
-    title = f"Innovations ÷ √S ({legend}): 95 % expected within ±2; ▲▼ beyond ±4"
-
-    def draw(axes: Axes) -> None:
-        axes.set(ylim=(-1.12 * MAX_DRAWN_SIGMAS, 1.12 * MAX_DRAWN_SIGMAS), yticks=(-2.0, 2.0))
-        axes.axhspan(-2.0, 2.0, color=style.CONSISTENT_BAND_COLOUR, lw=0, zorder=0.05)
-        style.draw_zero_line(axes)
-        for name in reversed(innovations):
-            draw_dots(axes, innovations[name], MAX_DRAWN_SIGMAS, style.INNOVATION_STYLES[name])
-
-    return TimePlot(title, draw)
+    title = f"Innovations ÷ √S ({legend}): 95 % expected within ±2; ▲▼ beyond ±{MAX_DRAWN_SIGMAS:g}"
+    axes = add_time_panel(page, analysis, title, PLOT_HEIGHT)
+    axes.set(ylim=(-1.12 * MAX_DRAWN_SIGMAS, 1.12 * MAX_DRAWN_SIGMAS), yticks=(-2.0, 2.0))
+    axes.axhspan(-2.0, 2.0, color=style.CONSISTENT_BAND_COLOUR, lw=0, zorder=0.05)
+    style.draw_zero_line(axes)
+    for name in reversed(innovations):
+        draw_dots(axes, innovations[name], MAX_DRAWN_SIGMAS, style.INNOVATION_STYLES[name])
 
 
 def _rotate_map_tracks(analysis: Analysis) -> tuple[dict[str, Array], tuple[str, str]]:

@@ -111,9 +111,7 @@ def _draw_contributions(
     axes.barh(rows, percents, height=0.7, color=KF_BAND_COLOUR, edgecolor=KF_COLOUR, lw=0.6)
     axes.set_yticks(rows, names)
     for row, percent in enumerate(percents):
-        digits = 1 if 0.05 <= abs(percent) < 9.95 else 0
-        text = f"{percent:z.{digits}f} %"
-        axes.text(1.05 * percents.max(), row, text, va="center", size=8.0)
+        axes.text(1.05 * percents.max(), row, f"{percent:z.1f} %", va="center", size=8.0)
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.set_xlim(min(0.0, 1.1 * percents.min()), 1.5 * percents.max())
     axes.set_xlabel("% of the mean square difference")

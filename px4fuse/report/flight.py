@@ -70,8 +70,6 @@ def _draw_enlarged_sigma_plot(page: Page, result: AxisComparison) -> None:
         axes.plot(logged_sigma_m, **style.dot_style(EKF2_COLOUR, "s", 3.0, 0.7), mfc="white")
     axes.set_xlim(start_s, end_s)
     axes.set_xlabel(style.TIME_LABEL)
-    if isinstance(ekf2.state, pd.DataFrame):
-        page.write_muted_text("EKF2: ▵ before and ▿ after an update, □ logged σ.")
 
 
 def find_zoom_span(result: AxisComparison) -> Span:
@@ -85,7 +83,8 @@ def find_zoom_span(result: AxisComparison) -> Span:
 def _describe_sigma_at_updates(result: AxisComparison) -> str:
     sentences = [
         "The line is σ of KF, which grows in each prediction (SIGMA_A "
-        f"{result.kf_run.settings.sigma_a_m_s2:g} m/s²)."
+        f"{result.kf_run.settings.sigma_a_m_s2:g} m/s²).",
+        "EKF2: ▵ before and ▿ after an update, □ logged σ.",
     ]
     for name, filter_summary in get_statistics_by_filter(result).items():
         sigma_before_m = filter_summary.sigma_p_before_update_m
