@@ -42,7 +42,7 @@ import px4fuse  # noqa: E402
 from px4fuse.analysis import Analysis  # noqa: E402
 from px4fuse.diagnose import diagnose_comparison  # noqa: E402
 from px4fuse.ekf2.aids import evaluate_aids  # noqa: E402
-from px4fuse.filter.frame_rotation import HeadingPart, combine_heading_parts  # noqa: E402
+from px4fuse.filter.frame_rotation import HeadingErrorInPart, combine_heading_parts  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
 from px4fuse.finding import Finding  # noqa: E402
 from px4fuse.findings import find, find_aid_findings, find_loop_findings, source_frame  # noqa: E402
@@ -52,7 +52,7 @@ from px4fuse.findings.model import (  # noqa: E402
     FINDING_GROUPS,
     FINDING_TITLES,
     find_effect_ids,
-    load_examples,
+    load_finding_examples,
 )
 from px4fuse.flight.model import AidLog, Columns  # noqa: E402
 from px4fuse.report.panels import INNOVATIONS_PANEL, POSITION_PANEL, POSITION_SIGMA_PANEL  # noqa: E402
@@ -68,7 +68,7 @@ SIGMA_Z_BY_AXIS_M = (0.05, 0.2, 0.1)
 FINDINGS_FOLDER = ROOT / "px4fuse" / "findings"
 EXAMPLES_PATH = FINDINGS_FOLDER / "examples.json"
 # Findings that no simulated flight shows; their examples in examples.json are of recorded flights
-IDS_WITH_RECORDED_EXAMPLE = {
+FINDING_IDS_WITH_RECORDED_EXAMPLE = {
     "ekf2_acceleration_bad",
     "ekf2_bias_at_limit",
     "ekf2_gps_delay_wrong",
@@ -83,7 +83,7 @@ IDS_WITH_RECORDED_EXAMPLE = {
 MAX_LABEL_LINE_LENGTH = 26  # maximum number of characters in a line of an axis label
 # For each finding id: faults (option --mistake of px4fuse simulate) and KF settings that cause the
 # finding
-FAULTS_AND_SETTINGS_BY_ID: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
+FAULTS_AND_SETTINGS_BY_FINDING_ID: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
     "accelerometer_bias": (("accel-bias",), {}),
     "ekf2_ev_delay_wrong": (("ekf2-delay=250ms",), {}),
     "ekf2_gate_too_small": (("ekf2-gate",), {}),
@@ -153,7 +153,7 @@ def collect_examples() -> dict[str, ExampleFlight]:
         for finding in findings:
             example_by_id.setdefault(finding.id, ExampleFlight(finding, flight, analysis))
 
-    for name, (faults, settings) in FAULTS_AND_SETTINGS_BY_ID.items():
+    for name, (faults, settings) in FAULTS_AND_SETTINGS_BY_FINDING_ID.items():
         flight = simulate_flight(Scenario(passes=4, seed=2), parse_faults(faults))
         analysis = diagnose_comparison(compare(flight, Settings(**settings)))
         command = " ".join(["px4fuse simulate", *(f"--mistake {fault}" for fault in faults)])
@@ -203,7 +203,7 @@ def collect_examples() -> dict[str, ExampleFlight]:
         "simulated odometry of three laps",
     )
     heading_errors_of_parts = [
-        HeadingPart(2.0 * n, 2.0 * n + 2.0, angle_deg, 1.0)
+        HeadingErrorInPart(2.0 * n, 2.0 * n + 2.0, angle_deg, 1.0)
         for n, angle_deg in enumerate((-36.0, -20.0, -9.0))
     ]
     aisle_analysis = unexplained(compare(aisle_flight(duration_s=20.0), axes=("north",)))
@@ -239,21 +239,21 @@ def collect_examples() -> dict[str, ExampleFlight]:
 
 def find_detector_modules() -> dict[str, str]:
     """Return the module name of the detector of each finding, by finding id."""
-    module_by_id: dict[str, str] = {}
+    module_by_finding_id: dict[str, str] = {}
     for path in sorted(FINDINGS_FOLDER.glob("*.py")):
         if path.stem in ("cause_text", "model", "__init__"):
             continue
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in ast.walk(tree):
             if isinstance(node, ast.Constant) and node.value in FINDING_TITLES:
-                module_by_id.setdefault(str(node.value), path.stem)
+                module_by_finding_id.setdefault(str(node.value), path.stem)
     # Modules whose finding ids are no literals, because they are composed of a name and a suffix
     for name in FINDING_TITLES:
         if name.startswith("sigma_") or name.endswith("confident"):
-            module_by_id[name] = "noises"
+            module_by_finding_id[name] = "noises"
         elif name.startswith("ekf2_noise_"):
-            module_by_id[name] = "ekf2_settings"
-    return module_by_id
+            module_by_finding_id[name] = "ekf2_settings"
+    return module_by_finding_id
 
 
 def is_numeric_literal(expression: ast.expr) -> bool:
@@ -349,7 +349,7 @@ def collect_finding_examples_and_rates(
 
     ``px4fuse explain`` prints them. Error rates: false alarms, and detection of each fault.
     """
-    table, recorded_example_by_id, contents = read_detection_rates(), load_examples(), {}
+    table, recorded_example_by_id, contents = read_detection_rates(), load_finding_examples(), {}
     for name in FINDING_TITLES:
         rows = table[table["finding"] == name]
         fault_free_rows = rows[rows["condition"] == "none"]
@@ -413,7 +413,7 @@ def write_finding_pages(folder: Path) -> None:
     mpl.use("Agg")
     folder.mkdir(parents=True, exist_ok=True)
     example_by_id = collect_examples()
-    missing_ids = set(FINDING_TITLES) - set(example_by_id) - IDS_WITH_RECORDED_EXAMPLE
+    missing_ids = set(FINDING_TITLES) - set(example_by_id) - FINDING_IDS_WITH_RECORDED_EXAMPLE
     assert not missing_ids, f"these findings have no example: {sorted(missing_ids)}"
     for name in FINDING_TITLES:
         text = "\n".join(format_page(name, example_by_id.get(name), folder))

@@ -20,7 +20,7 @@ from px4fuse.errors import OutputError, SettingsError
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.model import Loop
-from px4fuse.loop.tracks import LoopSource, read_source
+from px4fuse.loop.tracks import LoopSource, read_trajectory_source
 from px4fuse.readers import read_log
 from px4fuse.trajectory import evaluation
 from px4fuse.trajectory.evaluation import Evaluation
@@ -206,7 +206,7 @@ def _read_trajectory(
     """
     if isinstance(source, Trajectory):
         return source
-    return read_source(str(source), default_track=default_track).trajectory
+    return read_trajectory_source(str(source), default_track=default_track).trajectory
 
 
 def close_loop(
@@ -271,7 +271,7 @@ def close_loop(
     if isinstance(source, Trajectory):
         loop_source = LoopSource(source, None)
     else:
-        loop_source = read_source(str(source), frame=frame)
+        loop_source = read_trajectory_source(str(source), frame=frame)
     reference_track = (
         None if reference is None else _read_trajectory(reference, default_track="truth")
     )

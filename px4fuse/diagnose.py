@@ -66,7 +66,7 @@ from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.model import Ekf2Model, prepare_ekf2_model
 from px4fuse.ekf2.whatif import make_sweep_values, what_if
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.filter.signals import AISLE
+from px4fuse.filter.signals import AISLE_AXIS
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.findings import find, find_aid_findings
@@ -206,10 +206,10 @@ def refine_delay(comparison: Comparison, time_offset: SourceTimeOffset | Unavail
     refined_comparison = replace(comparison, convention=refined_convention)
     # A delay that is too small to be a fault is 0 in convention_faults. If one of the two delays is
     # 0, the comparison with the first delay is kept
-    is_fault_before_and_after = (
+    is_late_before_and_after_refinement = (
         comparison.convention_faults.late_s and refined_comparison.convention_faults.late_s
     )
-    return refined_comparison if is_fault_before_and_after else comparison
+    return refined_comparison if is_late_before_and_after_refinement else comparison
 
 
 def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress) -> Flight:
@@ -371,7 +371,7 @@ def run_what_if(
     progress("replaying EKF2")
     ekf2_model = require_available(prepare_ekf2_model(flight), flight)
     if has_no_user_change and ekf2_model.agreement.good:
-        comparison_request = structs.replace(comparison_request, axes=("north", "east", AISLE))
+        comparison_request = structs.replace(comparison_request, axes=("north", "east", AISLE_AXIS))
         prepared_comparison = prepare_comparison_inputs(flight, comparison_request)
         comparison = compare(prepared_comparison)
         tuning, time_offset = estimate_noises_and_time_offset(comparison, progress)
@@ -400,13 +400,15 @@ def analyse_loop_closure(request: LoopRequest, progress: Progress = ignore_progr
         A file cannot be read or lacks required data, or a setting is out of range.
     """
     from px4fuse.loop.analysis import analyse  # noqa: PLC0415 - not for tune and sync
-    from px4fuse.loop.tracks import find_odometry, read_source  # noqa: PLC0415
+    from px4fuse.loop.tracks import find_odometry, read_trajectory_source  # noqa: PLC0415
 
     progress(f"reading {display_name(Path(request.source))}")
     system, reference = request.system, None
-    source = read_source(request.source, frame=request.frame, system=system)
+    source = read_trajectory_source(request.source, frame=request.frame, system=system)
     if request.reference is not None:
-        reference = read_source(request.reference, default_track="truth", system=system).trajectory
+        reference = read_trajectory_source(
+            request.reference, default_track="truth", system=system
+        ).trajectory
     loop = analyse(source, request, reference, progress)
     if source.flight is None or loop.kind != "vio" or loop.is_assessed:
         return loop

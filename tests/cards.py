@@ -3,9 +3,9 @@
 from px4fuse.card.model import (
     Action,
     AnalysisDescription,
-    Card,
     CardRerun,
     DiagnosedCause,
+    DiagnosisCard,
     FlightErrors,
     Note,
     Verdict,
@@ -22,7 +22,7 @@ def verdicts(*ratios_and_words):
     return tuple(_verdict(*row, *pair) for row, pair in zip(rows, ratios_and_words, strict=True))
 
 
-SMALL_SIGMA_A = Card(
+SMALL_SIGMA_A = DiagnosisCard(
     severity="error",
     id="process_noise_near_zero",
     headline="SIGMA_A is 360 times too small: KF ignores new positions",

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from px4fuse.ekf2.filter_recursion import FilterConfiguration
+from px4fuse.ekf2.filter_batch import FilterConfiguration
 from px4fuse.ekf2.inputs import FusionRules, ReplayInputs
-from px4fuse.ekf2.intervals import EventIntervals, StepEvents, make_event_intervals
+from px4fuse.ekf2.intervals import EventIntervals, FusionEvents, make_event_intervals
 from px4fuse.ekf2.model import Ekf2Model, prepare_ekf2_model
 from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, ReplaySegment
 from px4fuse.ekf2.steps import DifferenceExplanation, explain_difference_by_replacements
@@ -78,7 +78,7 @@ def step_state(segment: ReplaySegment, k: int, x: np.ndarray) -> np.ndarray:
 
 
 def plain_replay(
-    inputs: ReplayInputs, segment: ReplaySegment, events: StepEvents
+    inputs: ReplayInputs, segment: ReplaySegment, events: FusionEvents
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return innovations and variances of a flight as flown, without rejections.
 

@@ -24,10 +24,10 @@ from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.hypotheses import Estimate, Jump, SystematicErrors
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, cut_to_segment
-from px4fuse.filter.time_offset import PartOffset, SourceTimeOffset
+from px4fuse.filter.time_offset import FlightPartTimeOffset, SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.finding import Finding
-from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
 from px4fuse.flight.model import (
     AS_RECEIVED_ORIGIN,
     NO_INVALID_ROWS,
@@ -80,7 +80,7 @@ class StandIn:
 def log(**parts: Any) -> Any:
     usual = {
         "parameters": {}, "notes": (), "format": "ULog", "writes_ulog": True, "autopilot": "PX4",
-        "find_default_value": lambda name: PARAMETERS[name].default,
+        "find_default_value": lambda name: MODEL_PARAMETERS[name].default,
         "dropouts": (), "damage": (), "ends_in_flight": False, "duration_s": 60.0, "bytes": 0,
         "bytes_read": 0, "restarts": None, "receive_time_reversals": None, "dropped": {},
     }  # fmt: skip
@@ -289,7 +289,9 @@ def late(
     remaining_s: float, sigma_s: float = 0.001, applied_s: float = 0.0, **parts: Any
 ) -> SourceTimeOffset:
     offset_s = applied_s + remaining_s
-    halves = tuple(PartOffset(0.0, 1.0, at, 0.1) for at in (offset_s - 0.2, offset_s + 0.2))
+    halves = tuple(
+        FlightPartTimeOffset(0.0, 1.0, at, 0.1) for at in (offset_s - 0.2, offset_s + 0.2)
+    )
     usual = {
         "interval_s": (offset_s - 0.01, offset_s + 0.02), "is_determinable": True,
         "change_p_value": None, "parts": halves,

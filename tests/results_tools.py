@@ -6,16 +6,16 @@ from pathlib import Path
 from typing import Any
 
 from px4fuse.core.record import Unavailable
-from px4fuse.loop.model import Closure, Loop, OdometryNoise, PathResult, TrueFinalPose
+from px4fuse.loop.model import Loop, LoopClosure, OdometryNoise, PathResult, TrueFinalPose
 from px4fuse.request import LoopRequest
 from px4fuse.results.contract import LoopResults, Results, to_json_dict
 from px4fuse.results.model import SCHEMA_VERSION, Schema, Student, provenance
 from px4fuse.results.reading import read_results
 from px4fuse.trajectory.alignment import Transform
 from px4fuse.trajectory.association import Association
-from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
-from px4fuse.trajectory.model import Track
-from px4fuse.trajectory.scores import RelativeError, RmseInterval, Statistics
+from px4fuse.trajectory.evaluation import AbsoluteTrajectoryError, Evaluation
+from px4fuse.trajectory.model import TrajectorySummary
+from px4fuse.trajectory.scores import RelativePoseError, RmseInterval, Statistics
 from px4fuse.trajectory.time_offset import TimeOffset
 
 SHIPPED = Path(__file__).parent.parent / "reports" / "example" / "aisle_uwb.json"
@@ -33,8 +33,8 @@ def correction(rmse: float, moved_m: float) -> PathResult:
         transform=Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 6),
         association=Association("interpolate", 9, 0.1, 0, 0, 1.0, 1.0),
         time_offset=TimeOffset(offset_s=0.0, is_determinable=True, reason=""),
-        ate=AbsoluteError(statistics, RmseInterval(rmse, rmse, 1, 9.0), NONE),
-        rpe=(RelativeError(5.0, "m", True, "reference", statistics, NONE, NONE),),
+        ate=AbsoluteTrajectoryError(statistics, RmseInterval(rmse, rmse, 1, 9.0), NONE),
+        rpe=(RelativePoseError(5.0, "m", True, "reference", statistics, NONE, NONE),),
         notes=(),
         warnings=(),
     )
@@ -47,7 +47,7 @@ LOOP = to_json_dict(
     LoopResults(
         schema=Schema("px4fuse-loop", SCHEMA_VERSION),
         request=LoopRequest(source="loop.ulg:vio"),
-        track=Track("loop.ulg:vio", SHA256, 9, "vio", "NED", 9, 1.0, 95.0, True, ()),
+        track=TrajectorySummary("loop.ulg:vio", SHA256, 9, "vio", "NED", 9, 1.0, 95.0, True, ()),
         references=(),
         loop=Loop(
             track="loop.ulg:vio",
@@ -73,7 +73,7 @@ LOOP = to_json_dict(
             is_absolute_track=False,
             odometry_noise=OdometryNoise(),
             closures=(
-                Closure(
+                LoopClosure(
                     time_1_s=1.0,
                     time_2_s=95.0,
                     sigma_m=0.1,

@@ -27,7 +27,7 @@ from px4fuse.classroom.assignment.random_assignment import (
     DIFFICULT_FAULTS_PROBABILITY,
     EASIEST_DIFFICULTY,
     HARDEST_DIFFICULTY,
-    LOOP_PROBABILITY,
+    LOOP_FLIGHT_PROBABILITY,
     MAX_FAULT_DIFFICULTY,
     PROBABILITY_BY_FAULT_COUNT,
     assign_random_flight,
@@ -132,7 +132,7 @@ class TestDraw:
     def test_assignment_of_kind_mixed_has_aisle_and_loop_flights(self):
         mixed = [assign_random_flight(SECRET, f"s{n}", "mixed") for n in range(1000)]
         kinds = Counter(one.scenario.kind for one in mixed)
-        assert kinds["loop"] / 1000 == pytest.approx(LOOP_PROBABILITY, abs=0.05)
+        assert kinds["loop"] / 1000 == pytest.approx(LOOP_FLIGHT_PROBABILITY, abs=0.05)
         assert all(
             one == assign_random_flight(SECRET, f"s{n}", one.scenario.kind)
             for n, one in enumerate(mixed)

@@ -32,7 +32,7 @@ from ulog_tools import gnss_log
 
 import px4fuse
 from px4fuse.batch import engine, job, run
-from px4fuse.batch.engine import connect_cluster, run_jobs
+from px4fuse.batch.engine import connect_to_cluster, run_jobs
 from px4fuse.batch.job import Job
 from px4fuse.batch.logs import find_logs
 from px4fuse.batch.rows import (
@@ -453,10 +453,10 @@ def test_batch_unreachable_cluster_raises_one_line_error(monkeypatch, flights):
     for address in ("tcp://127.0.0.1:1", "nonsense://x", ""):
         with (
             pytest.raises(SettingsError, match="no Dask scheduler answers"),
-            connect_cluster(address),
+            connect_to_cluster(address),
         ):
             pass
-    with connect_cluster() as client:
+    with connect_to_cluster() as client:
         assert client is None  # a failed client is not the default of this session
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(SettingsError, match=r'pip install "px4fuse\[batch\]"'):
@@ -505,7 +505,7 @@ def assert_failed_job_does_not_affect_others(address):
     jobs = [("square", 3), ("unreadable", 0), ("exit", 3), ("hang", 0), ("square", 4)]
     work = partial(run_with_limits, failing_jobs.run_job, timeout_s=5.0, max_memory_bytes=2 * 10**9)
     expected = [9, "cannot be read (ValueError)", "exit code 3", "limit of 5 s", 16]
-    with connect_cluster(address) as client:
+    with connect_to_cluster(address) as client:
         found = []
         for one, result in run_jobs(client, work, [*jobs, ("square", 5)]):
             if not found:

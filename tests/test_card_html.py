@@ -13,7 +13,7 @@ from explore_tools import axe, serious
 from msgspec import structs
 
 import px4fuse
-from px4fuse.card.model import Action, AnalysisDescription, Card, Note, map_ratio_to_axis
+from px4fuse.card.model import Action, AnalysisDescription, DiagnosisCard, Note, map_ratio_to_axis
 from px4fuse.core.text import format_ratio
 from px4fuse.report.card_html import (
     MARKER_SVG_PATHS,
@@ -102,7 +102,7 @@ def test_diagnosis_html_escapes_text_from_logs() -> None:
 
 
 def test_diagnosis_of_rejected_log_has_no_sigma_ratio_plot() -> None:
-    card = Card(
+    card = DiagnosisCard(
         severity="refused",
         id="not_px4",
         headline="an ArduPilot DataFlash log, not a PX4 ULog",

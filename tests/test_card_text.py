@@ -8,7 +8,7 @@ import pytest
 from cards import SMALL_SIGMA_A, verdicts
 from msgspec.structs import replace
 
-from px4fuse.card.model import Action, Card, Note
+from px4fuse.card.model import Action, DiagnosisCard, Note
 from px4fuse.report import card_text
 from px4fuse.report.card_text import draw_sigma_ratio, to_ascii, with_typed_path
 
@@ -16,7 +16,7 @@ SENDER = Action("sender", "subtract 0.264 s from the timestamp of each position"
 DELAY = Action("EKF2", "EKF2_EV_DELAY 0 → 264 ms", ("param set EKF2_EV_DELAY 264",), "console")
 
 
-def text_of(card: Card) -> list[str]:
+def text_of(card: DiagnosisCard) -> list[str]:
     return [text for line in card_text.format_card_lines(card) for text in line.wrap(100)]
 
 
@@ -52,7 +52,9 @@ def test_diagnosis_text_below_98_columns_has_ratios_without_plot() -> None:
     )
     assert any("─░" in text for text in wide)
     assert not any("─" in text for text in narrow)
-    ratio_lines = [text[: card_text.AXIS_INDENT].rstrip() for text in wide if "─░" in text]
+    ratio_lines = [
+        text[: card_text.SIGMA_RATIO_AXIS_INDENT].rstrip() for text in wide if "─░" in text
+    ]
     assert ratio_lines == [text for text in narrow if text in ratio_lines]
 
 

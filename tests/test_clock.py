@@ -51,7 +51,11 @@ from px4fuse.filter.imu_motion import (
 )
 from px4fuse.filter.likelihood import compute_profile_likelihood_interval
 from px4fuse.filter.signals import Segment
-from px4fuse.filter.time_offset import MAX_P_VALUE_OF_CHANGED_OFFSET, PartOffset, SourceTimeOffset
+from px4fuse.filter.time_offset import (
+    MAX_P_VALUE_OF_CHANGED_OFFSET,
+    FlightPartTimeOffset,
+    SourceTimeOffset,
+)
 from px4fuse.flight.model import (
     ALIGNED_BY_EKF2_ORIGIN,
     GNSS_ORIGIN,
@@ -168,7 +172,7 @@ def test_integrated_constant_acceleration_equals_closed_form() -> None:
         np.flatnonzero(~positions.is_within_segment) + 1, moved.segment_edges[1:-1]
     )
     # positions are relative to the first measured one of each stretch
-    edges = [*positions.segment_starts.tolist(), len(positions.measurement_m)]
+    edges = [*positions.segment_start_indices.tolist(), len(positions.measurement_m)]
     for begin, end in pairwise(edges):
         known = positions.measurement_m[begin:end, 0]
         known = known[np.isfinite(known)]
@@ -320,20 +324,16 @@ def test_time_offset_sigma_equals_width_of_likelihood_parabola() -> None:
 
 
 @pytest.mark.parametrize("offset_s", [0.0, -0.2, -0.21, 0.333])
-def test_time_offset_maximises_likelihood_sum_of_flight_parts(monkeypatch, offset_s) -> None:
+def test_time_offset_maximises_likelihood_sum_of_flight_parts(offset_s) -> None:
     """Use parabolas as profiles of the parts."""
     shift, sigma = np.array([-0.05, 0.025, 0.0, 0.0]), np.array([0.03, 0.02, 0.03, 0.5])
 
-    def fit_constant_errors(grid: Array, *_: object) -> SimpleNamespace:
+    def fit_at_offsets(grid: Array, _: object) -> SimpleNamespace:
         square = (grid - offset_s - shift[:, None]) ** 2 / sigma[:, None] ** 2
         return SimpleNamespace(compute_segment_scores=lambda: 0.5 * square[None])
 
-    monkeypatch.setattr(time_offset, "fit_constant_errors", fit_constant_errors)
     moved = SimpleNamespace(
-        segment_edges=np.arange(5) * 2,
-        time_s=np.arange(8.0),
-        make_position_batches=lambda grid: grid,
-        measurement_weights=None,
+        segment_edges=np.arange(5) * 2, time_s=np.arange(8.0), fit_at_offsets=fit_at_offsets
     )
     parts, p = time_offset._estimate_flight_part_offsets(
         moved, offset_s, NoiseParameters(0.1, 0.1), 1.0, 0.0
@@ -503,7 +503,8 @@ def stated(
     *offsets: float, sigma_s: float = 0.02, change_p_value: float | None = 1e-7
 ) -> SourceTimeOffset:
     parts = tuple(
-        PartOffset(30.0 * i, 30.0 * (i + 1), each, sigma_s) for i, each in enumerate(offsets)
+        FlightPartTimeOffset(30.0 * i, 30.0 * (i + 1), each, sigma_s)
+        for i, each in enumerate(offsets)
     )
     middle = float(np.mean(offsets))
     curve = np.array([0.0])

@@ -49,7 +49,9 @@ def test_loop_correction_removes_linear_heading_drift() -> None:
     turned = Rotation.from_rotvec(np.outer(share * drift, [0, 0, 1])) * rotation
     misclosure = drifted[-1] - position[-1]
     assert np.linalg.norm(misclosure) > 1.0
-    found = closure.correct_by_distance(trajectory(drifted, turned), distance, misclosure, drift)
+    found = closure.remove_closure_error_by_distance(
+        trajectory(drifted, turned), distance, misclosure, drift
+    )
     np.testing.assert_allclose(found.position_m, position, atol=1e-9)
     assert np.max((found.rotation * rotation.inv()).magnitude()) < 1e-9
     # distributing only the position leaves the shape sheared
@@ -60,7 +62,7 @@ def test_loop_correction_removes_linear_heading_drift() -> None:
 def test_key_frame_path_length_excludes_position_noise() -> None:
     position, _ = square(600, 20.0)  # 80 m, 3.3 cm a step
     noisy = position + np.random.default_rng(1).normal(0.0, 0.02, position.shape)
-    frames = closure.choose_key_frames(noisy, closure.compute_default_spacing_m(noisy))
+    frames = closure.choose_key_frames(noisy, closure.compute_default_key_frame_spacing_m(noisy))
     assert cumulative_distance(noisy)[-1] > 95.0
     assert abs(cumulative_distance(noisy[frames])[-1] - 80.0) < 0.8
     assert frames[0] == 0

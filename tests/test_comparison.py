@@ -9,7 +9,7 @@ from flights import Estimator, Imu, Uwb, aisle_flight
 from msgspec.structs import asdict
 from pyulog import ULog
 
-from px4fuse.comparison.model import AxisComparison, Comparison, Difference, UntestedFilter
+from px4fuse.comparison.model import AxisComparison, Comparison, FilterDifference, UntestedFilter
 from px4fuse.comparison.projection import project_fusion_horizon_position
 from px4fuse.core.arrays import Array
 from px4fuse.errors import SettingsError
@@ -240,7 +240,7 @@ class TestMissingParts:
         for result in comparison.axes.values():
             assert isinstance(result.filters["ekf2"], Unavailable)
             assert result.filters["ekf2"].sigma_p_before_update_m is None
-            assert isinstance(result.difference, Difference)
+            assert isinstance(result.difference, FilterDifference)
 
     def test_ekf2_nees_uses_variance_interpolated_to_ground_truth(self, made: Comparison) -> None:
         """EKF2's variances are logged at 1 Hz: none is within these 0.8 s of ground truth."""

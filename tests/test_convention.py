@@ -16,7 +16,7 @@ from flights import given_placement
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.convention.axes import CLOCKWISE_DIRECTIONS, METRES_PER_UNIT, SIGNED_AXIS_PERMUTATIONS
-from px4fuse.convention.check import check_convention
+from px4fuse.convention.check import determine_source_convention
 from px4fuse.convention.correction import ConventionFaults, find_convention_faults
 from px4fuse.convention.model import AxisDirections, Convention, OrientationConvention
 from px4fuse.diagnose import prepare_comparison, refine_delay
@@ -139,13 +139,15 @@ def test_frame_detection_finds_axes_unit_and_time_offset(index):
     rng = np.random.default_rng(index)
     axes, unit = ALL_AXES[index], [*METRES_PER_UNIT][index % 4]
     late_s = float(rng.uniform(-8.0, 8.0))
-    found = check_convention(flown(), sent(flown(), axes, unit, late_s=late_s, seed=index))
+    found = determine_source_convention(
+        flown(), sent(flown(), axes, unit, late_s=late_s, seed=index)
+    )
     assert_found(found, **dict(zip("xyz", axes, strict=True)), unit=unit, late_s=late_s)
 
 
 @pytest.mark.parametrize("rotation_deg", [-170.0, -60.0, 25.0, 45.0, 100.0])
 def test_frame_detection_finds_yaw_rotation_of_positions(rotation_deg):
-    found = check_convention(flown(), sent(flown(), rotation_deg=rotation_deg))
+    found = determine_source_convention(flown(), sent(flown(), rotation_deg=rotation_deg))
     quarter = CLOCKWISE_DIRECTIONS.index(found.x)
     assert not found.is_mirrored
     total = found.rotation_deg - 90.0 * quarter
@@ -158,19 +160,19 @@ def test_source_rotation_is_relative_to_gnss_if_heading_is_wrong():
     gnss = replace(sent(flown(), late_s=0.2, sigma_m=0.3, seed=2), origin=GNSS_ORIGIN)
     no_ekf2 = Unavailable("EKF2", "not logged", "")
     flight = replace(flown(), attitude=attitude, positions=(gnss,), ekf2=no_ekf2)
-    found = check_convention(flight, sent(flown(), rotation_deg=60.0))
+    found = determine_source_convention(flight, sent(flown(), rotation_deg=60.0))
     assert find_convention_faults(found, flight, "NED").rotation_deg == pytest.approx(60.0, abs=2.0)
 
 
 @pytest.mark.parametrize("clock_drift", [-0.04, -0.01, 0.02])
 def test_frame_detection_finds_clock_drift_of_source(clock_drift):
-    found = check_convention(flown(), sent(flown(), clock_drift=clock_drift, late_s=1.0))
+    found = determine_source_convention(flown(), sent(flown(), clock_drift=clock_drift, late_s=1.0))
     assert_found(found, clock_drift=clock_drift)
 
 
 def test_frame_detection_of_ned_positions_gives_ned_and_metres():
     track = flown().positions[0]
-    found = check_convention(flown(), track)
+    found = determine_source_convention(flown(), track)
     assert_found(found)
     assert abs(found.late_s) < 0.05
     assert found.rotation_deg == 0.0
@@ -181,20 +183,23 @@ def test_frame_detection_on_pure_noise_is_undetermined():
     track = sent(flown())
     noise = np.random.default_rng(2).normal(0.0, 0.3, (len(track.samples), 3))
     samples = track.samples.assign(**dict(zip(Columns.POSITION, noise.T, strict=True)))
-    assert check_convention(flown(), replace(track, samples=samples)).verdict == "not determinable"
+    assert (
+        determine_source_convention(flown(), replace(track, samples=samples)).verdict
+        == "not determinable"
+    )
 
 
 def test_frame_detection_ignores_repeated_positions():
     track = sent(flown())
     samples = track.samples.copy()
     samples.iloc[200:260] = samples.iloc[199].to_numpy()
-    assert_found(check_convention(flown(), replace(track, samples=samples)))
+    assert_found(determine_source_convention(flown(), replace(track, samples=samples)))
 
 
 def test_frame_detection_without_height_finds_horizontal_axes():
     track = sent(flown())
     samples = track.samples.assign(down_m=np.nan)
-    assert_found(check_convention(flown(), replace(track, samples=samples)))
+    assert_found(determine_source_convention(flown(), replace(track, samples=samples)))
 
 
 @pytest.mark.parametrize("frames", ["ENU", "NWU"])
@@ -202,7 +207,7 @@ def test_frame_detection_finds_orientation_sent_as_flu_to_enu(frames):
     time, attitude = oriented(flown())
     quaternion = multiply(multiply(np.array(NED_TO[frames]), attitude), np.array(NED_TO["NWU"]))
     track = reclassify_as_vio(sent(flown(), ENU if frames == "ENU" else NWU), quaternion, time)
-    found = check_convention(flown(), track).orientation
+    found = determine_source_convention(flown(), track).orientation
     assert found.frames == f"FLU to {frames}"
     assert abs(found.heading_error_deg) < 3.0
 
@@ -211,19 +216,19 @@ def test_frame_detection_finds_orientation_sent_as_flu_to_enu(frames):
 def test_frame_detection_finds_heading_error_of_orientation(error_deg):
     time, attitude = oriented(flown())
     track = reclassify_as_vio(sent(flown()), multiply(yaw(error_deg), attitude), time)
-    found = check_convention(flown(), track).orientation
+    found = determine_source_convention(flown(), track).orientation
     assert found.frames == "FRD to NED"
     difference = (found.heading_error_deg - error_deg + 180.0) % 360.0 - 180.0
     assert difference == pytest.approx(0.0, abs=3.0)
 
 
 def test_frame_detection_finds_quaternion_order_x_y_z_w():
-    found = check_convention(flown(), w_last(flown())).orientation
+    found = determine_source_convention(flown(), w_last(flown())).orientation
     assert (found.verdict, found.order) == ("determined", "x y z w")
 
 
 def test_orientation_copied_from_ekf2_is_detected():
-    assert check_convention(flown(), copied(flown())).orientation.verdict == "copied"
+    assert determine_source_convention(flown(), copied(flown())).orientation.verdict == "copied"
 
 
 def copied(flight: Flight) -> PositionTrack:
@@ -378,10 +383,10 @@ def test_low_pass_filtered_positions_are_not_reported_as_late(time_constant_s: f
     for row in range(1, len(position_m)):
         position_m[row] += np.exp(-0.1 / time_constant_s) * (position_m[row - 1] - position_m[row])
     filtered = track.samples.assign(**dict(zip(Columns.POSITION, position_m.T, strict=True)))
-    convention = check_convention(flown(), replace(track, samples=filtered))
+    convention = determine_source_convention(flown(), replace(track, samples=filtered))
     assert convention.verdict == "determined"
     assert abs(convention.late_s) < 0.3 * time_constant_s
-    delayed = check_convention(flown(), sent(flown(), late_s=time_constant_s))
+    delayed = determine_source_convention(flown(), sent(flown(), late_s=time_constant_s))
     assert delayed.late_s == pytest.approx(time_constant_s, abs=0.1)
 
 
@@ -437,7 +442,7 @@ def test_time_offset_is_not_reported_beside_clock_drift():
 @pytest.mark.parametrize("name", FLOWN)
 def test_frame_detection_on_sitl_log_finds_known_frame(name):
     flight = read_log(shared("logs/conventions") / f"{name}.ulg")
-    found = check_convention(flight, flight.positions[0])
+    found = determine_source_convention(flight, flight.positions[0])
     expected = dict(FLOWN[name])
     if name in ("yaw_90_off", "quaternion_xyzw"):  # the frame refers to EKF2's wrong heading
         expected |= {"x": found.x, "y": found.y}
@@ -450,7 +455,7 @@ def test_frame_detection_on_recorded_logs_finds_known_frame(name):
     file, expected = CASES[name]
     flight = read_log(shared("cases") / file)
     track = next(one for one in flight.positions if one.name == "vehicle_visual_odometry")
-    assert_found(check_convention(flight, track), **expected)
+    assert_found(determine_source_convention(flight, track), **expected)
 
 
 def test_convention_check_without_heights_keeps_horizontal_data() -> None:

@@ -17,7 +17,7 @@ from page_tools import axes_of, every, pdf_of, set_by_typst, smallest_type
 from pypdf import PdfReader
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import Action, AidConsistency, Card, DiagnosedCause, Note
+from px4fuse.card.model import Action, AidConsistency, DiagnosedCause, DiagnosisCard, Note
 from px4fuse.flight.model import Reset
 from px4fuse.report import cover
 from px4fuse.report.page import Page
@@ -26,17 +26,17 @@ from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import make_comparison_results
 
 
-def page_of(card: Card) -> Page:
+def page_of(card: DiagnosisCard) -> Page:
     page = Page()
     cover.add_card(page, card)
     return page
 
 
-def text_of(card: Card) -> str:
+def text_of(card: DiagnosisCard) -> str:
     return " ".join(" ".join(set_by_typst(page_of(card))).split())
 
 
-def free_height(card: Card) -> float:
+def free_height(card: DiagnosisCard) -> float:
     """Return the height (points) between a text below the card and the foot of the sheet."""
     page = page_of(card)
     page.write("after the card")

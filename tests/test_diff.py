@@ -20,7 +20,7 @@ from px4fuse.diagnose import diagnose_comparison
 from px4fuse.ekf2.aids import AidAxisStatistics, AidResult
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import make_comparison_results
-from px4fuse.results.contract import ChangeResults, ComparisonResults, to_json
+from px4fuse.results.contract import ComparisonResults, DiffResults, to_json
 from px4fuse.results.reading import read_results
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
@@ -75,7 +75,7 @@ def clean() -> InputResults:
     return flown(501)
 
 
-def by_path(found: ChangeResults) -> dict[str, tuple[float | None, float | None]]:
+def by_path(found: DiffResults) -> dict[str, tuple[float | None, float | None]]:
     return {one.path: (one.a, one.b) for one in found.numbers}
 
 

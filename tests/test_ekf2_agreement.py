@@ -14,9 +14,9 @@ from findings_tools import NONE, made
 
 from px4fuse.ekf2.replay import (
     CONSTANT_INNOVATIONS_REASON,
-    Agreement,
     AxisAgreement,
     Ekf2Replay,
+    ReplayAgreement,
     _compare_axis,
     _compare_other_aids,
     _compute_heading_difference_deg,
@@ -24,7 +24,7 @@ from px4fuse.ekf2.replay import (
     _subtract_logged_state,
     compare_with_log,
     is_inside_spans,
-    judge_with_logged_rejections,
+    judge_agreement_with_logged_rejections,
     logged_innovations,
     match_updates,
 )
@@ -121,24 +121,26 @@ def test_ekf2_replay_agrees_if_differences_are_below_limits(
 ])  # fmt: skip
 def test_ekf2_replay_agreement_is_tested_with_logged_rejections(axis, good):
     """The replay with logged rejections overrides the other verdict, good or bad."""
-    own_gate = Agreement(
+    own_gate = ReplayAgreement(
         north=agreeing(0.5), east=agreeing(0.5), ev_pos={}, samples=50,
         rejected_fraction_logged=0.2, rejected_fraction_replayed=0.2,
         decisions_same=0.9, published_rms_difference_m=0.0, good=not good, reason="so far",
     )  # fmt: skip
     logged_gate = replace(own_gate, north=agreeing(), east=axis, decisions_same=1.0,
                        rejected_fraction_replayed=0.3)  # fmt: skip
-    found = judge_with_logged_rejections(own_gate, logged_gate)
+    found = judge_agreement_with_logged_rejections(own_gate, logged_gate)
     assert found.good is good
     assert found.reason.startswith("in a replay that rejects the same samples as EKF2, ")
     assert (found.decisions_same, found.rejected_fraction_replayed) == (0.9, 0.2)
     assert found.axes == logged_gate.axes
     # above half of the positions the published position is not tested, but the correlation is
     mostly = replace(own_gate, rejected_fraction_logged=0.51)
-    assert judge_with_logged_rejections(
+    assert judge_agreement_with_logged_rejections(
         mostly, replace(logged_gate, east=agreeing(published_m=9.0))
     ).good
-    refused = judge_with_logged_rejections(mostly, replace(logged_gate, east=agreeing(0.98)))
+    refused = judge_agreement_with_logged_rejections(
+        mostly, replace(logged_gate, east=agreeing(0.98))
+    )
     assert not refused.good
     assert "0.9800" in refused.reason
     assert "rejected 51% of the positions and relied on the IMU" in refused.reason
@@ -194,7 +196,7 @@ def test_ekf2_replay_heading_error_without_logged_state_is_none():
 
 def compared(
     count: int, *, varying: bool = True, states: int | None = None
-) -> Agreement | Unavailable:
+) -> ReplayAgreement | Unavailable:
     """Return the agreement of a log and its own replay with this many evaluated samples.
 
     ``states``: number of logged states, from the start; None for one per innovation.

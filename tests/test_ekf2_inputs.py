@@ -39,9 +39,9 @@ from px4fuse.ekf2.whatif import make_sweep_values
 from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import (
     GNSS_POS,
-    PARAMETERS,
+    MODEL_PARAMETERS,
     check_parameters,
-    fill_with_defaults,
+    fill_parameters_with_defaults,
     uses_aid_mask,
 )
 from px4fuse.flight.model import (
@@ -62,7 +62,7 @@ from px4fuse.flight.model import (
     SourceOrigin,
     Unavailable,
 )
-from px4fuse.trajectory.rotation import to_matrix
+from px4fuse.trajectory.rotation import to_rotation_matrix
 
 ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
 AID = ("estimator_aid_src_ev_pos",)
@@ -73,14 +73,21 @@ AID = ("estimator_aid_src_ev_pos",)
 
 def test_ekf2_parameters_missing_in_log_have_px4_defaults():
     """Defaults of PX4's module.yaml and params_*.yaml, by fused aid."""
-    vision, gnss = fill_with_defaults({}), fill_with_defaults({}, GNSS_POS)
+    vision, gnss = fill_parameters_with_defaults({}), fill_parameters_with_defaults({}, GNSS_POS)
     for names, other_names, begin in ((vision, gnss, "EKF2_EV"), (gnss, vision, "EKF2_GPS")):
-        assert {*names} - {*other_names} == {name for name in PARAMETERS if name.startswith(begin)}
-    assert fill_with_defaults({"EKF2_AID_MASK": 1.0}, GNSS_POS)["EKF2_GPS_DELAY"] == 110.0
-    assert fill_with_defaults({})["EKF2_EV_DELAY"] == 0.0
-    assert fill_with_defaults({"EKF2_AID_MASK": 8.0})["EKF2_EV_DELAY"] == 175.0
+        assert {*names} - {*other_names} == {
+            name for name in MODEL_PARAMETERS if name.startswith(begin)
+        }
     assert (
-        fill_with_defaults({"EKF2_AID_MASK": 8.0, "EKF2_EV_DELAY": 50.0})["EKF2_EV_DELAY"] == 50.0
+        fill_parameters_with_defaults({"EKF2_AID_MASK": 1.0}, GNSS_POS)["EKF2_GPS_DELAY"] == 110.0
+    )
+    assert fill_parameters_with_defaults({})["EKF2_EV_DELAY"] == 0.0
+    assert fill_parameters_with_defaults({"EKF2_AID_MASK": 8.0})["EKF2_EV_DELAY"] == 175.0
+    assert (
+        fill_parameters_with_defaults({"EKF2_AID_MASK": 8.0, "EKF2_EV_DELAY": 50.0})[
+            "EKF2_EV_DELAY"
+        ]
+        == 50.0
     )
     assert not uses_aid_mask({"EKF2_AID_MASK": 8.0, "EKF2_EV_CTRL": 15.0})
 
@@ -351,7 +358,7 @@ def test_ekf2_replay_inputs_equal_motion_of_rotating_vehicle():
     steps = 10.5 + 0.01 * np.arange(101)
     assert_allclose(found.time_s, steps, atol=1e-9)
     assert_allclose(found.step_s, 0.01, atol=1e-9)
-    turned = to_matrix(facing(steps))
+    turned = to_rotation_matrix(facing(steps))
     assert_allclose(found.body_to_ned, turned, atol=1e-6)
     assert_allclose(found.attitude_correction_rad, 0.0, atol=1e-6)
     # body frame at the end of the step, without bias

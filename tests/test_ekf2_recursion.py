@@ -14,8 +14,8 @@ from exchange import replace
 from findings_tools import log, made
 from scipy.spatial.transform import Rotation
 
+from px4fuse.ekf2.filter_batch import FilterBatch, FilterConfiguration
 from px4fuse.ekf2.filter_recursion import (
-    FilterConfiguration,
     SegmentRun,
     _compute_steady_state_correlation,
     _FusionDecisions,
@@ -32,13 +32,13 @@ from px4fuse.ekf2.intervals import (
     FusionDelays,
     _compute_imu_process_noise,
     _find_fusion_actions,
-    _make_events,
+    _make_fusion_events,
     make_event_intervals,
 )
 from px4fuse.ekf2.model import Ekf2Model, replay_with_settings
-from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, ReplaySegment, add_field_states
+from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, ReplaySegment, add_magnetic_field_states
 from px4fuse.errors import SettingsError
-from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, fill_with_defaults
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, fill_parameters_with_defaults
 from px4fuse.trajectory.rotation import skew
 
 
@@ -66,14 +66,19 @@ def test_vision_measurements_apply_lever_arm_and_noise_minimum():
         "EKF2_EV_POS_Z": np.zeros(2),
     }  # fmt: skip
     inputs = made(ReplayInputs, received_positions=vision, imu_offset_m=np.zeros(3))
-    at = np.array([0]), np.array([[1]])
-    position, noise = measurements(inputs, segment, *at, parameters, np.array([True, True]))
+    both = made(
+        FilterBatch, inputs=inputs, segment=segment, parameters=parameters,
+        event_steps=np.array([[1, 1]]), events={"sample": np.zeros((1, 2), int)},
+        uses_reported_noise=np.array([True, True]),
+    )  # fmt: skip
+    position, noise = measurements(both)
     # 0.3 m ahead of a body that faces east: the body is west of the sensor
     assert np.isnan(position[..., :3]).all()
     np.testing.assert_allclose(position[0, :, 3:], [[1, 2, 3], [1, 1.7, 3]], atol=1e-12)
     # the reported variance, at least EKF2_EVP_NOISE; or EKF2_EVP_NOISE only, at least 1 cm
     np.testing.assert_allclose(noise[0, :, 3:], [[0.04, 0.01, 0.01], [1e-4, 1e-4, 1e-4]])
-    _, noise = measurements(inputs, segment, *at, parameters, np.array([False, False]))
+    both.uses_reported_noise = np.array([False, False])
+    _, noise = measurements(both)
     np.testing.assert_allclose(noise[0, :, 3:], [[0.01, 0.01, 0.01], [1e-4, 1e-4, 1e-4]])
 
 
@@ -93,13 +98,13 @@ def deciding(
     velocity_gap_s: float = 0.0,
 ) -> tuple[bool, bool, bool, float, bool, int]:
     """Return rejected, fused and reset at 10 s; then last fusion, stopped, remaining resets."""
-    fusion = _FusionDecisions(
-        rules, 10.0 - gap_s, sample_actions=np.array([[action]]),
+    fusion = made(
+        _FusionDecisions, fusion_rules=rules, sample_actions=np.array([[action]]),
         can_start_fusion=np.array([[can_start_fusion]]),
         time_s=np.array([[10.0]]), has_gate=np.array([has_gate]),
         uses_logged_decisions=np.array([follows_log]),
         logged_rejected_flags=np.array([logged]), logged_resets=np.array([logged_reset]),
-        is_every_reset_logged=False,
+        is_every_reset_logged=False, last_position_s=np.array([10.0 - gap_s]),
     )  # fmt: skip
     fusion.last_velocity_s = np.array([10.0 - velocity_gap_s])
     fusion.is_stopped, fusion.remaining_resets = np.array([stopped]), np.array([left])
@@ -346,7 +351,9 @@ def at_rest(
     if field_gauss is not None:
         at, known = np.arange(7, count, 7), np.append(field_gauss, np.zeros(3))
         gauss = np.tile(field_gauss, (len(at), 1))
-        segment = add_field_states(segment, segment.time_s[at], gauss, 1.0, known, np.full(6, 1e-8))
+        segment = add_magnetic_field_states(
+            segment, segment.time_s[at], gauss, 1.0, known, np.full(6, 1e-8)
+        )
         segment.variance[2] = 0.01
     stamp = 10.105 + 0.1 * np.arange(len(measured_m))
     north = np.array(measured_m)
@@ -362,7 +369,7 @@ def at_rest(
         reset_times_s=reset_s,
     )
     inputs = ReplayInputs(
-        fill_with_defaults(settings, aid, *([MAG] if segment.magnetic_field else [])),
+        fill_parameters_with_defaults(settings, aid, *([MAG] if segment.magnetic_field else [])),
         (segment,), vision,
         rules, 0.01, 0.1, 0.01,
         fuses_vision_height=False, imu_offset_m=np.zeros(3), aid=aid,
@@ -483,7 +490,7 @@ def events(
         rules=RULES,
         max_height_fusion_interval_in_position_gap_s=0.25,
     )
-    return _make_events(inputs, stretch_of(100), FusionDelays(delay_s, horizon_s))
+    return _make_fusion_events(inputs, stretch_of(100), FusionDelays(delay_s, horizon_s))
 
 
 def test_ekf2_replay_fuses_each_sample_at_end_of_an_interval():

@@ -19,12 +19,12 @@ from px4fuse.ekf2.model import Ekf2Model
 from px4fuse.ekf2.replay import Ekf2Replay, compute_rmse_to_truth, interpolate_component
 from px4fuse.ekf2.replay_segments import ReplaySegment, SensorSamples
 from px4fuse.ekf2.steps import (
-    ATTITUDE_PROPERTY,
-    FLOW_PROPERTY,
-    GNSS_VELOCITY_PROPERTY,
-    MAGNETOMETER_PROPERTY,
-    OUTPUT_PREDICTOR_PROPERTY,
-    REJECTION_PROPERTY,
+    ATTITUDE_REPLACEMENT_NAME,
+    FLOW_REPLACEMENT_NAME,
+    GNSS_VELOCITY_REPLACEMENT_NAME,
+    MAGNETOMETER_REPLACEMENT_NAME,
+    OUTPUT_PREDICTOR_REPLACEMENT_NAME,
+    REJECTION_REPLACEMENT_NAME,
     DifferenceExplanation,
     _find_longest_rejection,
     explain_difference_by_replacements,
@@ -97,7 +97,10 @@ def test_contributions_to_kf_ekf2_difference_add_up_to_total(model):
         assert by_name["measurement noise"].position_moved_m < 1e-6
         assert by_name["rejections and resets"].position_moved_m < 1e-6
         largest = sorted(axis.steps, key=lambda step: -step.position_mean_square_m2)[:2]
-        assert {step.name for step in largest} == {"process noise", OUTPUT_PREDICTOR_PROPERTY}
+        assert {step.name for step in largest} == {
+            "process noise",
+            OUTPUT_PREDICTOR_REPLACEMENT_NAME,
+        }
         last = axis.steps[-1].position_rmse_to_truth_m
         assert last == pytest.approx(axis.position_rmse_to_truth_m["ekf2"], abs=0.003)
 
@@ -157,11 +160,11 @@ def test_steps_from_kf_to_ekf2_replace_one_property_each():
         made(ReplayInputs, **{**vars(gnss), **more}), kf_settings
     )
     assert list(configurations)[-5:] == [
-        ATTITUDE_PROPERTY,
-        MAGNETOMETER_PROPERTY,
-        GNSS_VELOCITY_PROPERTY,
-        FLOW_PROPERTY,
-        REJECTION_PROPERTY,
+        ATTITUDE_REPLACEMENT_NAME,
+        MAGNETOMETER_REPLACEMENT_NAME,
+        GNSS_VELOCITY_REPLACEMENT_NAME,
+        FLOW_REPLACEMENT_NAME,
+        REJECTION_REPLACEMENT_NAME,
     ]
     assert ["mag" in each.disable_time_s_by_aid for each in configurations.values()] == [
         True
@@ -343,7 +346,7 @@ def test_what_if_sensitive_to_noise_is_marked_unpredictable(model, monkeypatch):
         monkeypatch.setattr(whatif, "add_position_noise", add_position_noise)
         monkeypatch.setattr(whatif, "replay_with_settings", lambda _, changes, **_more: changes)
         monkeypatch.setattr(whatif, "_summarise_replay", lambda *_: changed)
-        (found,) = whatif._mark_unpredictable(model, [base], ((0.0, 1.0),), {})
+        (found,) = whatif._mark_unpredictable_statistics(model, [base], ((0.0, 1.0),), {})
         return found.is_predictable
 
     assert is_predictable(base)
@@ -362,7 +365,8 @@ def test_what_if_sensitive_to_noise_is_marked_unpredictable(model, monkeypatch):
     few, many = (structs.replace(base, rejected_fraction=share) for share in (0.02, 0.351))
     runs.clear()
     assert [
-        one.is_predictable for one in whatif._mark_unpredictable(model, [few, many], (), {})
+        one.is_predictable
+        for one in whatif._mark_unpredictable_statistics(model, [few, many], (), {})
     ] == [
         True,
         False,

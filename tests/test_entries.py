@@ -109,7 +109,7 @@ def test_grade_of_reports_without_time_has_no_deduction() -> None:
 
 
 @pytest.mark.parametrize(
-    ("extension", "grace_s", "lateness_s"),
+    ("extension", "grace_period_s", "lateness_s"),
     [
         ("", 0.0, 46 * 3600.0),
         ("2026-11-22 09:00", 0.0, 3541.0),
@@ -118,9 +118,11 @@ def test_grade_of_reports_without_time_has_no_deduction() -> None:
     ],
 )
 def test_due_date_extension_and_grace_period_reduce_lateness(
-    extension, grace_s, lateness_s
+    extension, grace_period_s, lateness_s
 ) -> None:
-    term = Course(RUBRIC, due=DUE, grace_s=grace_s, late_rule=parse_late_rule("10%/day"))
+    term = Course(
+        RUBRIC, due=DUE, grace_period_s=grace_period_s, late_rule=parse_late_rule("10%/day")
+    )
     people = (replace(PEOPLE[0], extended_due=extension), *PEOPLE[1:])
     (ada, _), _ = make_grades(THREE, term, people=people)
     assert (ada.lateness_s, ada.deducted_points > 0.0) == (lateness_s, lateness_s > 0.0)

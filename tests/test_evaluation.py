@@ -27,7 +27,7 @@ from px4fuse.trajectory.scores import (
     RmseInterval,
     RpePairDistance,
     compute_autocorrelation_time,
-    compute_relative_error,
+    compute_relative_pose_error,
     compute_statistics,
     estimate_rmse_interval,
     find_pose_pairs,
@@ -325,7 +325,7 @@ def test_rpe_pairs_are_chosen_by_reference_distance() -> None:
     reference = flight(30.0)
     double = transformed(reference, TURN, SHIFT, 2.0, kind="vio")
     same, other = (
-        compute_relative_error(one, reference, RpePairDistance(1.0, "m"))
+        compute_relative_pose_error(one, reference, RpePairDistance(1.0, "m"))
         for one in (reference, double)
     )
     assert other.pairs_from == "reference"

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from trajectory_tools import flight, transformed
 
 from px4fuse.core.text import format_metres
-from px4fuse.loop.tracks import read_source
+from px4fuse.loop.tracks import read_trajectory_source
 from px4fuse.report.evaluation import (
     describe_rpe_growth,
     describe_unaligned_rmse,
@@ -33,7 +33,10 @@ DELTAS = (RpePairDistance(1.0, "m"), RpePairDistance(10.0, "m"))
 @cache
 def sample() -> Evaluation:
     """Evaluate the odometry of the sample against its SLAM trajectory, which has a gap."""
-    odometry, slam = read_source(f"{LOOP}:vio"), read_source(str(LOOP.with_name("loop_slam.tum")))
+    odometry, slam = (
+        read_trajectory_source(f"{LOOP}:vio"),
+        read_trajectory_source(str(LOOP.with_name("loop_slam.tum"))),
+    )
     return evaluate(odometry.trajectory, slam.trajectory)
 
 

@@ -18,7 +18,7 @@ from ulog_tools import make_log
 from px4fuse.filter.kalman import predict_track
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import compute_ned_acceleration
-from px4fuse.flight.model import ClockMap, Dropout, Flight, InputFile, Reset
+from px4fuse.flight.model import ClockConversion, Dropout, Flight, InputFile, Reset
 from px4fuse.info import tables as extraction
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate, to_ulog
@@ -50,7 +50,9 @@ def rich_flight() -> Flight:
     resets = Reset(5.0, "position", (0.5, 0.0, -1.0)), Reset(6.0, "velocity", (0, 1, 0))
     ekf2 = Estimator(resets=resets, primary_instances=((-np.inf, 0), (9.0, 1)))
     flight = aisle_flight(duration_s=20.0, ekf2=ekf2, dropouts=(Dropout(3.0, 0.2),))
-    clock = ClockMap('UNIX time, "quoted"', "TIMESYNC", 512, -1.7e9 / 3, 2.5, 0.001, "a, note")
+    clock = ClockConversion(
+        'UNIX time, "quoted"', "TIMESYNC", 512, -1.7e9 / 3, 2.5, 0.001, "a, note"
+    )
     file = InputFile("uwb.csv", "00" * 32, 10, "position")
     return replace(flight, clocks=(clock,), inputs=(file,))
 

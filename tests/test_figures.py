@@ -11,7 +11,7 @@ from px4fuse.classroom.assignment.figures import (
     FIGURE_ANSWERS_BY_FAULT,
     QUESTIONS,
     draw_figures,
-    select_choices,
+    make_choice_questions,
 )
 from px4fuse.classroom.assignment.random_assignment import draw_uniform
 from px4fuse.results.answer_form import (
@@ -24,7 +24,7 @@ from px4fuse.results.answer_form import (
 
 def test_correct_answers_on_one_figure_describe_one_fault() -> None:
     for number in range(20):
-        choices = select_choices(partial(draw_uniform, b"secret", f"s{number}", "aisle"))
+        choices = make_choice_questions(partial(draw_uniform, b"secret", f"s{number}", "aisle"))
         assert len(choices) == len(QUESTIONS) * figures.FIGURE_COUNT <= MAX_CHOICES
         for first in range(0, len(choices), len(QUESTIONS)):
             rows = zip(choices[first:], QUESTIONS, strict=False)
@@ -39,7 +39,9 @@ def test_correct_answers_on_one_figure_describe_one_fault() -> None:
 
 def test_each_multiple_choice_letter_is_correct_equally_often() -> None:
     draws = [partial(draw_uniform, b"secret", f"s{number}", "aisle") for number in range(200)]
-    letters = [letter for random_number in draws for _, letter in select_choices(random_number)]
+    letters = [
+        letter for random_number in draws for _, letter in make_choice_questions(random_number)
+    ]
     for name in CHOICE_LETTERS:
         assert letters.count(name) / len(letters) == pytest.approx(0.2, abs=0.03)
 

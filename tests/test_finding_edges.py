@@ -39,7 +39,7 @@ from flights import given_placement
 from px4fuse.comparison.flight_events import find_source_gaps
 from px4fuse.comparison.rerun_effects import Rerun, RunStatistics
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
-from px4fuse.filter.frame_rotation import HeadingError, HeadingPart
+from px4fuse.filter.frame_rotation import HeadingError, HeadingErrorInPart
 from px4fuse.filter.frame_rotation import combine_heading_parts as together
 from px4fuse.filter.hypotheses import Estimate, SystematicErrors
 from px4fuse.filter.settings import Settings
@@ -76,10 +76,11 @@ from px4fuse.flight.model import (
     KEPT_BY_EKF2_ORIGIN,
     MOTION_CAPTURE_ORIGIN,
     REBUILT_FROM_INNOVATIONS_ORIGIN,
-    ClockMap,
+    ClockConversion,
     Columns,
     Dropout,
     Reset,
+    Truth,
     Unavailable,
 )
 
@@ -502,7 +503,9 @@ def test_frd_frame_finding_is_a_note_if_ekf2_fuses_source_yaw(
 
 
 def heading_error(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> HeadingError:
-    parts = (HeadingPart(10.0 * n, 10.0 * n + 10.0, d, sigma_deg) for n, d in enumerate(degrees))
+    parts = (
+        HeadingErrorInPart(10.0 * n, 10.0 * n + 10.0, d, sigma_deg) for n, d in enumerate(degrees)
+    )
     return together(tuple(parts), p, "positions")
 
 
@@ -637,7 +640,7 @@ def bias_of_ekf2(*bias: float) -> dict[str, Any]:
 
 
 def clock_map(method: str = "TIMESYNC", distinct: int | None = None, jitter_s: float = 0.02) -> Any:
-    return ClockMap("UNIX time", method, 600, 0.0, 0.0, jitter_s, "", distinct)
+    return ClockConversion("UNIX time", method, 600, 0.0, 0.0, jitter_s, "", distinct)
 
 
 def at_multiples(multiples: list[int], base_s: float = 0.125, **parts: Any) -> Any:
@@ -942,15 +945,16 @@ def test_scale_and_variance_findings_state_sign_of_error() -> None:
 @pytest.mark.parametrize(("error_m", "expected"), [(1.41, "error"), (1.42, None)])
 def test_position_variance_that_covers_true_error_is_accepted(error_m, expected):
     time = np.arange(0.0, 120.0)
-    still = pd.DataFrame({"position_m": 0.0 * time}, index=time)
-    axes = tuple(axis(name, truth=still) for name in ("north", "east"))
-    for each in axes:
+    axes = tuple(axis(name) for name in ("north", "east"))
+    for each, direction in zip(axes, np.eye(3), strict=False):
         each.axis.measurement_time_s, each.axis.measurement_m = time, error_m * (-1.0) ** time
-    assert (
-        severity(source_positions.detect_wrong_variance, stating(2.0, 1.0, axes=axes)) == expected
-    )
+        each.axis.direction = direction
+    flight = {"truth": Truth("still", positions(time))}
+    subject = stating(2.0, 1.0, axes=axes, flight=flight)
+    assert severity(source_positions.detect_wrong_variance, subject) == expected
     # a variance that is too small is reported in both cases
-    assert severity(source_positions.detect_wrong_variance, stating(0.5, 1.0, axes=axes)) == "error"
+    subject = stating(0.5, 1.0, axes=axes, flight=flight)
+    assert severity(source_positions.detect_wrong_variance, subject) == "error"
 
 
 @pytest.mark.parametrize(

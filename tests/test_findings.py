@@ -27,14 +27,14 @@ from px4fuse.findings.model import (
     FINDING_CATALOGUE,
     FINDING_GROUPS,
     FINDING_TITLES,
-    load_examples,
+    load_finding_examples,
     split_cause_groups,
 )
 from px4fuse.flight.model import (
     ALIGNED_BY_EKF2_ORIGIN,
     AXIS_NAMES,
     AidLog,
-    ClockMap,
+    ClockConversion,
     Columns,
     Dropout,
     Ekf2,
@@ -93,8 +93,8 @@ def without_every(nth: int) -> Change:
     return change
 
 
-def mapped(method: str, distinct: int | None = None, jitter_s: float = 0.02) -> ClockMap:
-    return ClockMap("UNIX time of system 1", method, 600, -1e9, 0.1, jitter_s, "", distinct)
+def mapped(method: str, distinct: int | None = None, jitter_s: float = 0.02) -> ClockConversion:
+    return ClockConversion("UNIX time of system 1", method, 600, -1e9, 0.1, jitter_s, "", distinct)
 
 
 def with_ekf2(**changes: Any) -> Change:
@@ -587,7 +587,7 @@ def test_each_reportable_fault_belongs_to_a_known_group() -> None:
 
 
 def test_explain_command_examples_show_measured_detection_rates() -> None:
-    examples = load_examples()
+    examples = load_finding_examples()
     assert list(examples) == list(FINDING_CATALOGUE)
     rows = pd.read_csv(Path(__file__).parent / "studies" / "rates.csv")
     for name, example in examples.items():
@@ -608,7 +608,7 @@ def test_explain_command_prints_meaning_and_example_of_fault(typed, monkeypatch,
     monkeypatch.setenv("COLUMNS", "2000")  # no line breaks
     code, out, err = run_main(monkeypatch, capsys, "explain", typed)
     assert (code, err) == (0, "")
-    example = load_examples()["source_scale_error"]
+    example = load_finding_examples()["source_scale_error"]
     for text in (
         FINDING_TITLES["source_scale_error"],
         FINDING_CATALOGUE["source_scale_error"].meaning,

@@ -12,7 +12,7 @@ from findings_tools import NONE, analysis, made, moving, named, only, positions,
 from px4fuse.ekf2.fusion_conditions import UnfusedPositions, find_unmet_condition
 from px4fuse.findings import ekf2_fusion
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
-from px4fuse.flight.model import GNSS_ORIGIN, POSITION_FILE_ORIGIN, AidLog, ClockMap, Ekf2
+from px4fuse.flight.model import GNSS_ORIGIN, POSITION_FILE_ORIGIN, AidLog, ClockConversion, Ekf2
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_innovations import has_fused_aid
 
@@ -61,8 +61,8 @@ def rejecting(share: float) -> dict[str, Any]:
     return {"aids": {"ev_pos": made(AidLog, samples=samples)}}
 
 
-def clock(name: str) -> ClockMap:
-    return ClockMap(name, "arrival time", 100, 0.0, 0.0, 0.0)
+def clock(name: str) -> ClockConversion:
+    return ClockConversion(name, "arrival time", 100, 0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(

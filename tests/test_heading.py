@@ -16,7 +16,7 @@ from px4fuse.filter import frame_rotation
 from px4fuse.filter.frame_rotation import (
     MAX_DRIFT_P_VALUE,
     HeadingError,
-    HeadingPart,
+    HeadingErrorInPart,
     estimate_heading_error,
 )
 from px4fuse.filter.settings import Settings
@@ -185,6 +185,8 @@ def test_heading_error_is_estimated_for_all_parts_of_long_flight() -> None:
 def test_heading_drift_requires_minimum_angle_and_small_p_value() -> None:
     for spread, drift_p, drifts in ((1.0, 0.0, True), (0.999, 0.0, False), (9.0, 1.0, False)):
         turns = (0.0, spread * frame_rotation.MIN_HEADING_DRIFT_DEG)
-        parts = tuple(HeadingPart(float(n), n + 1.0, turn, 0.1) for n, turn in enumerate(turns))
+        parts = tuple(
+            HeadingErrorInPart(float(n), n + 1.0, turn, 0.1) for n, turn in enumerate(turns)
+        )
         found = frame_rotation.combine_heading_parts(parts, drift_p, "positions")
         assert (found.drifts, found.misalignment_deg) == (drifts, pytest.approx(np.mean(turns)))

@@ -15,8 +15,10 @@ from findings_tools import made
 
 from px4fuse.analysis import WhatIfAnalysis
 from px4fuse.ekf2.barometer import estimate_barometer_interval_s, find_fused_barometer_samples
-from px4fuse.ekf2.filter_recursion import FilterConfiguration, SegmentRun
-from px4fuse.ekf2.heights import BadAccelerationFlag, HeightFilter, add_heights
+from px4fuse.ekf2.filter_batch import FilterBatch, FilterConfiguration
+from px4fuse.ekf2.filter_recursion import SegmentRun
+from px4fuse.ekf2.height_samples import add_heights
+from px4fuse.ekf2.heights import BadAccelerationFlag, HeightFilter
 from px4fuse.ekf2.model import Ekf2Model, run_configurations
 from px4fuse.ekf2.replay_segments import HeightSamples, ReplaySegment
 from px4fuse.ekf2.whatif import HEIGHT_LOGGED_NOTE, what_if
@@ -71,13 +73,14 @@ def fusing(
     reference_until: float = np.inf,
     has_gate: bool = True,
 ) -> HeightFilter:
-    there, time_s = np.zeros((len(end), 1), bool), segment.time_s[end][:, None]
-    on = {"baro_hgt": np.ones_like(there), "gnss_hgt": time_s < reference_until}
-    parameters = {"EKF2_BARO_NOISE": np.array([0.5]), "EKF2_BARO_GATE": np.array([5.0])}
-    return HeightFilter(
-        segment, end[:, None], time_s, there, on, parameters, np.array([has_gate]),
-        BadAccelerationFlag(np.array([True]), 3.0, segment),
+    has_fix, time_s = np.zeros((len(end), 1), bool), segment.time_s[end][:, None]
+    batch = made(
+        FilterBatch, segment=segment, event_steps=end[:, None],
+        events=np.rec.fromarrays([time_s], names="time_s"), has_gate=np.array([has_gate]),
+        is_enabled_by_aid={"baro_hgt": np.ones_like(has_fix), "gnss_hgt": time_s < reference_until},
+        parameters={"EKF2_BARO_NOISE": np.array([0.5]), "EKF2_BARO_GATE": np.array([5.0])},
     )  # fmt: skip
+    return HeightFilter(batch, has_fix, BadAccelerationFlag(np.array([True]), 3.0, segment))
 
 
 def standing(of: HeightSamples, count: int = 400, **how: Any) -> tuple[HeightFilter, pd.DataFrame]:

@@ -152,10 +152,10 @@ def test_write_to_protected_input_file_is_refused(tmp_path) -> None:
 def test_input_file_without_inode_number_is_not_overwritten(tmp_path, monkeypatch) -> None:
     """Simulate a file system that ignores case and gives every file the inode 0."""
     from px4fuse.core.input_files import (
-        add_input,
         check_output_folder,
         check_outputs,
         protect_inputs,
+        register_input_path,
     )
 
     real, real_names = Path.stat, Path.iterdir
@@ -173,7 +173,7 @@ def test_input_file_without_inode_number_is_not_overwritten(tmp_path, monkeypatc
     monkeypatch.setattr(Path, "stat", stat)
     monkeypatch.setattr(Path, "iterdir", lambda self: real_names(lower(self)))
     with protect_inputs():
-        add_input(notes)
+        register_input_path(notes)
         check_outputs([notes.with_name("other.md")])
         with pytest.raises(OutputError):
             check_outputs([notes.with_name("NOTES.md")])

@@ -9,8 +9,8 @@ import pytest
 
 from px4fuse.comparison.error_patterns import (
     ErrorFit,
-    find_offset_variation,
     find_periodic_error,
+    find_time_offset_variation,
 )
 from px4fuse.flight.model import rows_between, time_index
 
@@ -42,13 +42,13 @@ def peak_bytes(work: Callable[[], object]) -> int:
 
 def test_memory_of_time_offset_fit_grows_linearly_with_duration():
     short, long = (fit_of(count, varying_offset) for count in (1000, 8000))
-    peaks = [peak_bytes(lambda fit=fit: find_offset_variation(fit)) for fit in (short, long)]
+    peaks = [peak_bytes(lambda fit=fit: find_time_offset_variation(fit)) for fit in (short, long)]
     assert peaks[1] < 10.0 * peaks[0]
 
 
 def test_time_offset_per_flight_part_equals_numpy_least_squares():
     fit = fit_of(600, varying_offset)
-    found = find_offset_variation(fit)
+    found = find_time_offset_variation(fit)
     parts = np.floor(fit.time_s / 4.0).astype(int)
     square_speeds = np.bincount(parts, np.sum(fit.velocity_m_s**2, axis=1)) / np.bincount(parts)
     moving = np.flatnonzero(square_speeds > 0.3**2)

@@ -23,7 +23,7 @@ from px4fuse.loop.corrections import (
     compute_odometry_variances,
 )
 from px4fuse.loop.model import Loop, OdometryNoise
-from px4fuse.loop.tracks import LoopSource, read_source, split_path_and_part
+from px4fuse.loop.tracks import LoopSource, read_trajectory_source, split_path_and_part
 from px4fuse.request import ComparisonRequest, GivenClosure, Landing, LoopRequest
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import Trajectory, TrajectoryKind
@@ -39,12 +39,12 @@ SIDE_M = 10.0
 
 @pytest.fixture(scope="module")
 def sample() -> LoopSource:
-    return read_source(str(SAMPLE))
+    return read_trajectory_source(str(SAMPLE))
 
 
 @pytest.fixture(scope="module")
 def sample_loop(sample: LoopSource) -> Loop:
-    return analyse(sample, reference=read_source(str(SLAM)).trajectory)
+    return analyse(sample, reference=read_trajectory_source(str(SLAM)).trajectory)
 
 
 def analyse_loop(source: LoopSource, reference: Trajectory | None = None, **how: Any) -> Loop:
@@ -182,12 +182,12 @@ def test_loop_closure_error_with_known_landing_equals_truth(
 
 @pytest.mark.reallogs
 def test_loop_closure_error_from_tlog_equals_ground_truth(shared_logs: Path) -> None:
-    found = analyse(read_source(str(shared_logs / "mavlink" / "v1.16.1_loop_vio.tlog")))
+    found = analyse(read_trajectory_source(str(shared_logs / "mavlink" / "v1.16.1_loop_vio.tlog")))
     assert found.closure_error_m == pytest.approx(true_closure_error_m(), abs=0.05)
 
 
 def test_loop_command_on_absolute_positions_gives_warning() -> None:
-    source = read_source(str(REPOSITORY / "sample_logs" / "aisle_uwb.ulg"))
+    source = read_trajectory_source(str(REPOSITORY / "sample_logs" / "aisle_uwb.ulg"))
     assert source.trajectory.kind == "ekf2"
     found = analyse(source)
     assert found.is_absolute_track
@@ -335,7 +335,7 @@ def test_loop_reports_same_orientation_fault_as_compare(
     flight = replace(sample.flight, positions=(replace(track, orientation=turned),))
     for flown, expected in ((sample.flight, []), (flight, ["source_orientation_wrong"])):
         source = LoopSource(sample.trajectory, flown)
-        monkeypatch.setattr(tracks, "read_source", lambda *_, one=source, **_more: one)
+        monkeypatch.setattr(tracks, "read_trajectory_source", lambda *_, one=source, **_more: one)
         loop = analyse_loop_closure(LoopRequest(source=""))
         found = find_loop_findings(loop)
         assert [one.id for one in found] == expected
@@ -397,7 +397,7 @@ def test_pose_graph_correction_interpolates_between_key_frames(sample_loop: Loop
 
 
 def test_loop_closure_times_may_be_unix_or_from_first_pose() -> None:
-    source = read_source(str(SLAM))
+    source = read_trajectory_source(str(SLAM))
     relative = analyse_loop(source, closures=(GivenClosure(3.0, 80.0, 0.3),))
     start = float(source.trajectory.time_s[0])
     stamped = analyse_loop(source, closures=(GivenClosure(start + 3.0, start + 80.0, 0.3),))
@@ -405,7 +405,7 @@ def test_loop_closure_times_may_be_unix_or_from_first_pose() -> None:
 
 
 def test_loop_on_slam_file_rotates_camera_frame_to_z_down() -> None:
-    source = read_source(str(SLAM))
+    source = read_trajectory_source(str(SLAM))
     found = analyse_loop(source, landed_at=Landing(0.0, 0.0))
     assert found.odometry.trajectory.frame == "FRD"
     assert found.closure_error_m < 0.7  # the vehicle landed 0.4 m from its start

@@ -17,12 +17,12 @@ from scipy.stats import norm
 
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.filter.fitting import (
-    INITIAL_OUTLIER_FRACTION,
-    INITIAL_OUTLIER_SIGMA_RATIO,
+    INITIAL_OUTLIERS,
     NegativeLogLikelihood,
     NoiseFit,
     NoiseParameters,
-    _compute_outlier_probability,
+    OutlierDistribution,
+    add_noises,
     compute_variance_factor_of_ln_sigma_z,
     convert_to_positions_and_increments,
     fit_constant_errors,
@@ -126,7 +126,7 @@ WEAK = np.array([1e-6, 1e-4])  # prior precision of position and velocity
 WEIGHT = np.random.default_rng(2).uniform(0.1, 1.0, COUNT)
 SOME_NOISES = [
     NoiseParameters(0.5, 0.1), NoiseParameters(0.05, 0.1), NoiseParameters(2.0, 0.1),
-    NoiseParameters(0.5, 0.02), NoiseParameters(0.5, 1.0), NoiseParameters(0.5, 0.1, 0.3),
+    NoiseParameters(0.5, 0.02), NoiseParameters(0.5, 4.0), NoiseParameters(0.5, 0.1, 0.3),
     NoiseParameters(0.5, 0.1, 0.0, 0.3, 0.7), NoiseParameters(0.5, 0.1, 0.3, 0.05, 3.0),
 ]  # fmt: skip
 
@@ -146,7 +146,7 @@ def with_constants(offsets: int = 3) -> PositionsAndIncrements:
     initial = np.zeros((COUNT, 2))
     initial[START] = WEAK
     return PositionsAndIncrements(
-        measurement_m=measured, segment_starts=START, interval_s=length,
+        measurement_m=measured, segment_start_indices=START, interval_s=length,
         process_noise_per_sigma_a_squared=0.1
         * np.stack(compute_continuous_process_noise_per_density(length)),
         process_noise_independent_of_sigma_a=np.outer(
@@ -162,12 +162,8 @@ def arguments(
     positions: PositionsAndIncrements, noises: NoiseParameters, weight: Array
 ) -> tuple[Any, float, Array]:
     """Return the arguments of :func:`fit_positions`."""
-    if noises.correlated_sigma_m:
-        positions = replace(positions, correlated_noise=(noises.correlated_sigma_m, noises.tau_s))
-    scaled, variance = positions.divide_sigmas_by_sigma_z(
-        1.0, noises.random_walk_m, weight / noises.sigma_z_m**2
-    )
-    return scaled, noises.sigma_a_m_s2, variance
+    noisy, variance = add_noises(positions, noises, weight)
+    return noisy, noises.sigma_a_m_s2, variance
 
 
 def stretch_normal(
@@ -504,9 +500,8 @@ def test_sigma_of_noise_estimate_follows_likelihood_curvature(axes, share, width
     curved = np.linalg.inv(hessian(score, best, initial_step=0.05).ddf)[0, 0]
     sigma, wide = np.exp(best[0]), np.exp(best[1])
     over = square / sigma**2
-    found = _compute_outlier_probability(
-        over, np.full(4000, axes), float(expit(best[2])), float(wide)
-    )
+    outliers = OutlierDistribution(float(expit(best[2])), float(wide))
+    found = outliers.compute_probability(over, np.full(4000, axes))
     widening = compute_variance_factor_of_ln_sigma_z(over, np.full(4000, axes), found, float(wide))
     assert widening > 1.1
     assert widening == pytest.approx(curved * 2.0 * axes * 4000, rel=0.01)
@@ -530,19 +525,11 @@ def test_outlier_probability_follows_bayes_rule() -> None:
     """Bayes: ε N(e; 0, w²σ²) against (1 - ε) N(e; 0, σ²), over all axes."""
     error = np.linspace(0.0, 6.0, 25)
     for axes in (1, 2):
-        narrow = (1.0 - INITIAL_OUTLIER_FRACTION) * norm.pdf(error) ** axes
-        wide = INITIAL_OUTLIER_FRACTION * norm.pdf(error, scale=INITIAL_OUTLIER_SIGMA_RATIO) ** axes
-        got = _compute_outlier_probability(
-            axes * error**2,
-            np.full(25, axes),
-            INITIAL_OUTLIER_FRACTION,
-            INITIAL_OUTLIER_SIGMA_RATIO,
+        narrow = (1.0 - INITIAL_OUTLIERS.fraction) * norm.pdf(error) ** axes
+        wide = (
+            INITIAL_OUTLIERS.fraction * norm.pdf(error, scale=INITIAL_OUTLIERS.sigma_ratio) ** axes
         )
+        got = INITIAL_OUTLIERS.compute_probability(axes * error**2, np.full(25, axes))
         np.testing.assert_allclose(got, wide / (wide + narrow), rtol=1e-9)
     # where the density underflows
-    assert (
-        _compute_outlier_probability(
-            np.array([1e200]), np.ones(1), INITIAL_OUTLIER_FRACTION, INITIAL_OUTLIER_SIGMA_RATIO
-        )
-        == 1.0
-    )
+    assert INITIAL_OUTLIERS.compute_probability(np.array([1e200]), np.ones(1)) == 1.0

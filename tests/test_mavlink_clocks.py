@@ -28,7 +28,7 @@ from mavlink_tools import (
 )
 
 from px4fuse.errors import SettingsError
-from px4fuse.flight.model import Flight, sample_rate
+from px4fuse.flight.model import Flight, compute_sample_rate_hz
 from px4fuse.readers import read_log
 from px4fuse.readers.mavlink_recording import ClockLine, fit_clock_line
 from px4fuse.readers.mavlink_senders import map_clock_to_boot
@@ -301,7 +301,7 @@ def test_mavlink_autopilot_without_heartbeat_is_found(read, change, stamped):
             recorder.hear(unix(boot), COMPANION, point)
     flight = read(recorder, stamped=stamped)
     assert flight.log.duration_s == pytest.approx(aisle.seconds, abs=0.1)
-    assert sample_rate(flight.imu) == pytest.approx(aisle.imu_hz, rel=0.01)
+    assert compute_sample_rate_hz(flight.imu) == pytest.approx(aisle.imu_hz, rel=0.01)
     if change is not CONSTANT_CLOCK:  # for constant timestamps the times are receive times
         assert len(flight.imu) == aisle.seconds * aisle.imu_hz
         np.testing.assert_allclose(np.diff(flight.imu.index), 1.0 / aisle.imu_hz, atol=1e-5)

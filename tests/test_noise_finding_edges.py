@@ -38,9 +38,9 @@ from px4fuse.findings import cause_text, hidden_errors, loops, noises
 from px4fuse.findings.ekf2_settings import detect_wrong_noise
 from px4fuse.findings.model import group_by_cause
 from px4fuse.findings.noises import _has_default_noises
-from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, MODEL_PARAMETERS
 from px4fuse.flight.model import AS_RECEIVED_ORIGIN, GNSS_ORIGIN
-from px4fuse.loop.model import Closure, Loop, TrueFinalPose
+from px4fuse.loop.model import Loop, LoopClosure, TrueFinalPose
 from px4fuse.report.tuning import list_tuning_advice
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
@@ -184,11 +184,10 @@ def test_tune_does_not_advise_smaller_noise_for_gnss(
     assert dict(list_tuning_advice(flight, fitted)).keys() == expected
 
 
-def test_finding_states_that_reruns_use_sigma_z_of_5_mm_or_more() -> None:
+def test_untested_sigma_z_above_upper_bound_is_reported() -> None:
     bounded = tuned(NoiseEstimate(None, None, 0.0021))
     finding = only(noises.detect_wrong_settings, analysis(source=MOVING, tuning=bounded))
     assert finding.remedy == UNTESTED_SIGMA_Z
-    assert finding.message.endswith("Re-runs use a SIGMA_Z of at least 0.005 m.")
     assert finding.title.startswith("SIGMA_Z is at least 480 times too large")
     assert "estimate is at most 0.0021 m. KF's" in finding.message
 
@@ -472,7 +471,7 @@ def test_wrong_default_noise_finding_names_position_sensor(
     flown_m: float, kind: str, rejected: float, expected: tuple[str, str, str]
 ) -> None:
     aid = GNSS_POS if kind == "gnss" else EV_POS
-    estimate_m = 4.0 * flown_m if flown_m == PARAMETERS[aid.noise].default else 0.1
+    estimate_m = 4.0 * flown_m if flown_m == MODEL_PARAMETERS[aid.noise].default else 0.1
     outcome = RunStatistics(nis_mean=16.0 if estimate_m > flown_m else 0.1)
     change = {aid.noise: estimate_m}
     rerun = Rerun(filter="ekf2", axis="north", kinds=("noise",), change=change, before=outcome,
@@ -490,7 +489,6 @@ def test_wrong_default_noise_finding_names_position_sensor(
     finding = only(detect_wrong_noise, one)
     assert (finding.id, finding.severity, finding.title) == expected
     assert finding.remedy == f"Set {aid.noise} to {estimate_m:.3g} m."
-    assert finding.message.endswith(f"KF takes SIGMA_Z from {aid.noise}.") is (kind == "gnss")
     received.variance_m2[:] = 9.0
     if kind == "uwb" and estimate_m < flown_m:
         rerun.change["EKF2_EV_NOISE_MD"] = 1.0
@@ -509,14 +507,14 @@ def test_wrong_default_noise_finding_names_position_sensor(
 
 def closure(
     gnc: float | None = 1.0, *, accepted: bool = True, where: str = "landing", p: float = 0.5
-) -> Closure:
-    return Closure(
+) -> LoopClosure:
+    return LoopClosure(
         time_1_s=10.0, time_2_s=90.0, sigma_m=0.1, source=where, distance_m=3.0, d2=25.0,
         degrees_of_freedom=2, p=p, accepted=accepted, weight_gnc=gnc,
     )  # fmt: skip
 
 
-def loop(*closures: Closure, **parts: Any) -> Loop:
+def loop(*closures: LoopClosure, **parts: Any) -> Loop:
     """Make a loop with these properties."""
     return made(Loop, closures=closures, **parts)
 
@@ -533,7 +531,7 @@ def loop(*closures: Closure, **parts: Any) -> Loop:
     ],
 )  # fmt: skip
 def test_loop_closure_with_small_gnc_weight_is_reported(
-    closures: tuple[Closure, ...], expected: list[str]
+    closures: tuple[LoopClosure, ...], expected: list[str]
 ) -> None:
     found = list(loops.detect_inconsistent_closures(loop(*closures, is_end_assumed=False)))
     assert [finding.id for finding in found] == expected
@@ -621,7 +619,7 @@ def test_source_drift_finding_states_closure_error_if_known(loop: Any, size: str
 def test_changed_setting_text_contains_old_and_new_value(
     owner: Any, change: dict[str, float], expected: str
 ) -> None:
-    model = SimpleNamespace(inputs=SimpleNamespace(settings=dict.fromkeys(PARAMETERS, 7.0)))
+    model = SimpleNamespace(inputs=SimpleNamespace(settings=dict.fromkeys(MODEL_PARAMETERS, 7.0)))
     one = analysis(settings=replace(CHOSEN, clock_offset_s=0.1), ekf2_model=model)
     assert cause_text.format_change(one, tried(owner, change)) == expected
 

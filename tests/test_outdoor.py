@@ -41,7 +41,7 @@ from px4fuse.simulation import sensors
 from px4fuse.simulation.faults import FaultSizes, parse_faults
 from px4fuse.simulation.flights import simulate, simulate_flight, to_ulog
 from px4fuse.simulation.scenario import Scenario, make_scenario
-from px4fuse.trajectory.rotation import interpolate, to_matrix
+from px4fuse.trajectory.rotation import interpolate, to_rotation_matrix
 
 OUTDOOR = make_scenario("outdoor", seed=5)
 
@@ -108,7 +108,7 @@ def test_simulated_magnetometer_and_height_noise_equal_settings(tmp_path: Path) 
         measured.index.to_numpy(), flight.truth.attitude.index.to_numpy(),
         flight.truth.attitude[Columns.QUATERNION].to_numpy(),
     )  # fmt: skip
-    expected = np.einsum("nji,j->ni", to_matrix(true), sensors.EARTH_FIELD_GAUSS)
+    expected = np.einsum("nji,j->ni", to_rotation_matrix(true), sensors.EARTH_FIELD_GAUSS)
     off = measured.drop(columns="fused_3d").to_numpy() - expected
     before = measured.index < 60.0
     np.testing.assert_allclose(off[before].mean(axis=0), 0.0, atol=0.008)

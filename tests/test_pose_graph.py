@@ -17,15 +17,15 @@ from px4fuse.readers.g2o import parse_g2o, read_g2o
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.covariance import gate_edges
 from px4fuse.trajectory.graph.model import (
-    INITIAL_POSES_FROM_CHORDAL,
+    INITIAL_POSES_FROM_CHORDAL_INITIALISATION,
     INITIAL_POSES_FROM_ODOMETRY,
     PoseGraph,
     _compute_chordal_poses,
-    compose_odometry,
     compute_initial_poses,
     compute_observed_directions,
     cost,
     residuals,
+    set_poses_from_odometry,
 )
 from px4fuse.trajectory.graph.solver import analyse_graph, solve
 
@@ -64,7 +64,7 @@ def noisy_graph(dimension: int, seed: int, poses: int = 30, sigma: float = 0.05)
     measured = lie.compose(exact, lie.exp(rng.normal(size=(len(first), free)) * sigma))
     information = np.tile(np.eye(free) / sigma**2, (len(first), 1, 1))
     made = PoseGraph(dimension, np.arange(poses), truth, first, second, measured, information)
-    return compose_odometry(made)
+    return set_poses_from_odometry(made)
 
 
 # --- initial poses -------------------------------------------------------------------------------
@@ -112,7 +112,7 @@ def test_chordal_initialisation_equals_dense_least_squares(dimension: int, seed:
     weights = [(-root, root) for root in roots]
     position = least_squares(weights, values, graph.poses[0, :d]).reshape(n - 1, d)
     made = _compute_chordal_poses(graph)
-    assert made.initial_pose_origin == INITIAL_POSES_FROM_CHORDAL
+    assert made.initial_pose_origin == INITIAL_POSES_FROM_CHORDAL_INITIALISATION
     np.testing.assert_array_equal(made.poses[0], graph.poses[0])
     np.testing.assert_allclose(lie.rotation_matrix(made.poses), rotation, atol=1e-7)
     np.testing.assert_allclose(made.poses[1:, :d], position, rtol=1e-6, atol=1e-6)
@@ -149,8 +149,8 @@ def test_pose_graph_minimum_cost_equals_gtsam(name: str) -> None:
 @pytest.mark.parametrize("name", ["SE-Sync_manhattan", "SE-Sync_CSAIL", "SE-Sync_kitti_00"])
 def test_g2o_without_vertices_starts_from_chordal_solution(name: str) -> None:
     graph = read_g2o(shared("pose_graphs") / f"{name}.g2o")
-    assert graph.initial_pose_origin == INITIAL_POSES_FROM_CHORDAL
-    assert cost(graph) < 1e-3 * cost(compose_odometry(graph))
+    assert graph.initial_pose_origin == INITIAL_POSES_FROM_CHORDAL_INITIALISATION
+    assert cost(graph) < 1e-3 * cost(set_poses_from_odometry(graph))
     assert solve(graph).cost < 0.9 * cost(graph) or name == "SE-Sync_CSAIL"
 
 
@@ -403,7 +403,7 @@ def test_loop_closure_gate_distance_equals_gtsam(dimension: int, is_back: bool) 
     order = GTSAM_ORDER if dimension == 3 else [0, 1, 2]
     marginal = gtsam.Marginals(factors, values).marginalCovariance(len(graph) - 1)
     covariance = marginal[np.ix_(order, order)]
-    pose = lie.relative_pose(graph.poses[0], compose_odometry(chain).poses[-1])
+    pose = lie.relative_pose(graph.poses[0], set_poses_from_odometry(chain).poses[-1])
     for off in np.random.default_rng(5).normal(size=(4, free)) * 1e-6:
         measured = lie.compose(pose, lie.exp(-off))
         closure = replace(

@@ -41,7 +41,7 @@ from px4fuse.flight.model import (
     Unavailable,
 )
 from px4fuse.readers import read_log
-from px4fuse.readers.px4_innovations import MAX_VARIANCE_TIME_DIFFERENCE_S
+from px4fuse.readers.px4_innovations import MAX_TIME_FROM_INNOVATION_TO_VARIANCE_S
 from px4fuse.readers.px4_positions import find_motion_capture_truth
 
 HALF_PERIOD_S = 0.005  # s; half of the prediction interval, EKF2_PREDICT_US 10,000
@@ -330,7 +330,7 @@ def test_ekf2_innovation_without_variance_near_it_is_dropped(read):
     for name in late:
         late[name] = late[name][kept]
     ekf2 = read(log).ekf2
-    assert times(ekf2.innovations["north"]).max() < 5.0 + MAX_VARIANCE_TIME_DIFFERENCE_S
+    assert times(ekf2.innovations["north"]).max() < 5.0 + MAX_TIME_FROM_INNOVATION_TO_VARIANCE_S
 
 
 def test_ekf2_innovations_while_vision_is_not_fused_are_dropped(read):

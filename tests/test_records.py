@@ -15,8 +15,8 @@ from px4fuse.results.contract import schema
 
 # Mutable buffers, which are filled while reading, writing or replaying
 BUFFERS = {
-    "ArrayEncoder", "Recording", "Topics", "_FusionDecisions",
-    "_PdfComparison", "_RunState",
+    "ArrayEncoder", "Recording", "Topics",
+    "_PdfComparison", "_BatchState",
 }  # fmt: skip
 
 

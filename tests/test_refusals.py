@@ -11,7 +11,7 @@ from cli_tools import contents, run_main
 from conftest import REPOSITORY
 from ulog_tools import make_log
 
-from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
 
 pytestmark = pytest.mark.usefixtures("cached_analyses")
 
@@ -138,7 +138,7 @@ REFUSED = {
     **{
         f"what if {typed}": (f"whatif missing.ulg {typed}", said)  # before the log is read
         for typed, said in (
-            ("--set EKF2_BARO_DELAY=1", ", ".join(PARAMETERS)),
+            ("--set EKF2_BARO_DELAY=1", ", ".join(MODEL_PARAMETERS)),
             ("--set EKF2_EVP_NOISE", "is not NAME=VALUE"),
             ("--set EKF2_EVP_NOISE=much", "EKF2_EVP_NOISE: 'much' is not a number"),
             ("--set EKF2_EVP_GATE=4SD", "'4SD' is not a number in SD. Give 4"),

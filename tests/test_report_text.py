@@ -17,7 +17,7 @@ from matplotlib import font_manager
 from page_tools import set_by_typst
 
 from px4fuse.analysis import Analysis
-from px4fuse.filter.time_offset import PartOffset, SourceTimeOffset
+from px4fuse.filter.time_offset import FlightPartTimeOffset, SourceTimeOffset
 from px4fuse.finding import Finding
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import clock, fonts, notes, typesetting
@@ -190,7 +190,9 @@ def test_typst_template_cannot_read_files(code: str, monkeypatch: pytest.MonkeyP
 
 def offset(**changes: Any) -> SourceTimeOffset:
     curve = np.linspace(-0.1, 0.1, 21)
-    parts = tuple(PartOffset(10.0 * i, 10.0 * i + 9.0, 0.06 * (i - 1), 0.02) for i in range(3))
+    parts = tuple(
+        FlightPartTimeOffset(10.0 * i, 10.0 * i + 9.0, 0.06 * (i - 1), 0.02) for i in range(3)
+    )
     return replace(
         SourceTimeOffset(
             applied_s=0.0, offset_s=0.005, interval_s=(-0.02, 0.03), sigma_s=0.012,

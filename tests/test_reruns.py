@@ -28,7 +28,7 @@ from px4fuse.comparison.reruns import (
     rerun_filters,
 )
 from px4fuse.diagnose import diagnose_comparison
-from px4fuse.ekf2.filter_recursion import FilterConfiguration
+from px4fuse.ekf2.filter_batch import FilterConfiguration
 from px4fuse.ekf2.model import add_position_noise, misalign_positions, replay_with_settings
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.frame_rotation import HeadingError

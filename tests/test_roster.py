@@ -13,9 +13,9 @@ from px4fuse.classroom.assignment.roster import (
     ClassList,
     Person,
     Sheet,
+    read_csv_sheet,
     read_people,
     read_roster,
-    read_sheet,
 )
 from px4fuse.classroom.grading.model import ExportOrigin
 from px4fuse.classroom.grading.outputs import fill_grades, find_grade_column
@@ -68,7 +68,7 @@ def written(tmp_path: Path, content: str | bytes, encoding: str = "utf-8-sig") -
 
 
 def table(tmp_path: Path, text: str, encoding: str = "utf-8-sig") -> Sheet:
-    return read_sheet(written(tmp_path, text, encoding))
+    return read_csv_sheet(written(tmp_path, text, encoding))
 
 
 # -- class lists -----------------------------------------------------------------------------------
@@ -236,7 +236,7 @@ def test_fill_grades_changes_only_grade_and_feedback(
     if text is MOODLE:
         assert people[0][feedback] == "Points 87.5<br>&nbsp;&nbsp;&lt;b&gt;=1+1&lt;/b&gt;"
     if text is not BLACKBOARD:
-        assert any("above the maximum of 100 on the platform" in note for note in notes)
+        assert any("above the maximum of 100 in the table" in note for note in notes)
 
 
 def test_fill_grades_matches_anonymous_row_by_participant_number(tmp_path) -> None:

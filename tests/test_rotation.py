@@ -12,7 +12,7 @@ from px4fuse.trajectory.rotation import (
     interpolate,
     multiply,
     skew,
-    to_matrix,
+    to_rotation_matrix,
     to_rotation_vector,
 )
 
@@ -45,13 +45,15 @@ def test_quaternion_functions_equal_scipy() -> None:
     turns = rng.normal(0.0, 0.7, (50, 3))
     q = from_rotation_vector(turns)
     theirs = Rotation.from_rotvec(turns)
-    assert to_matrix(q) == pytest.approx(theirs.as_matrix(), abs=1e-12)
+    assert to_rotation_matrix(q) == pytest.approx(theirs.as_matrix(), abs=1e-12)
     assert to_rotation_vector(q) == pytest.approx(turns, abs=1e-12)
     assert to_rotation_vector(-q) == pytest.approx(turns, abs=1e-12)
     assert to_rotation_vector(from_rotation_vector(np.zeros((1, 3)))) == pytest.approx(
         np.zeros((1, 3))
     )
     both = multiply(q[:25], q[25:])
-    assert to_matrix(both) == pytest.approx((theirs[:25] * theirs[25:]).as_matrix(), abs=1e-12)
+    assert to_rotation_matrix(both) == pytest.approx(
+        (theirs[:25] * theirs[25:]).as_matrix(), abs=1e-12
+    )
     v, u = rng.normal(size=(2, 3))
     assert skew(v) @ u == pytest.approx(np.cross(v, u))

@@ -4,7 +4,12 @@ import tomllib
 
 import pytest
 
-from px4fuse.classroom.grading.rubric import AnyRubricItem, parse_rubric, read_rubric, rubric_text
+from px4fuse.classroom.grading.rubric import (
+    AnyRubricItem,
+    parse_rubric,
+    read_default_rubric_text,
+    read_rubric,
+)
 from px4fuse.errors import SettingsError
 
 ITEM = '[[item]]\ntitle = "T"\npoints = 5\n'
@@ -13,7 +18,7 @@ NUMBER = ITEM + 'check = "number"\npath = "a.b"\n'
 
 
 def test_default_rubric_contains_each_check_and_its_parameters():
-    text = rubric_text()
+    text = read_default_rubric_text()
     used = {item["check"] for item in tomllib.loads(text)["item"]}
     checks = AnyRubricItem.__args__
     assert used == {check.__struct_config__.tag for check in checks}
@@ -32,7 +37,7 @@ def test_default_rubric_has_60_points_or_180_with_answer_key(kind):
 
 def test_read_copy_of_default_rubric_gives_equal_rubric(tmp_path):
     path = tmp_path / "rubric.toml"
-    path.write_bytes(b"\xef\xbb\xbf" + rubric_text().replace("\n", "\r\n").encode())
+    path.write_bytes(b"\xef\xbb\xbf" + read_default_rubric_text().replace("\n", "\r\n").encode())
     assert read_rubric(path) == read_rubric(None)
 
 

@@ -41,7 +41,7 @@ from px4fuse.simulation.flights import (
     to_flight,
     to_ulog,
 )
-from px4fuse.simulation.motion import compute_attitude, compute_direction, plan_flight
+from px4fuse.simulation.motion import compute_attitude_and_imu, compute_direction, plan_flight
 from px4fuse.simulation.scenario import DT_S, Scenario, collect_field_bounds
 
 NO_FAULTS = FaultSizes()
@@ -116,7 +116,8 @@ class TestMotion:
         time = np.linspace(0.0, motion.duration_s, 20_001)
         step = 1e-4
         before, here, after = (
-            compute_attitude(motion.compute_true_state(time + s)) for s in (-step, 0.0, step)
+            compute_attitude_and_imu(motion.compute_true_state(time + s))
+            for s in (-step, 0.0, step)
         )
         force = np.einsum("nij,nj->ni", here.body_to_ned, here.specific_force_m_s2)
         force[:, 2] += 9.80665
@@ -165,7 +166,7 @@ def test_simulated_imu_noise_averaged_over_dt_equals_sigma_a(texts):
     simulation = simulate(scenario, parse_faults(texts))
     imu = to_flight(simulation).imu
     time = imu.index.to_numpy()
-    truth = compute_attitude(simulation.motion.compute_true_state(time))
+    truth = compute_attitude_and_imu(simulation.motion.compute_true_state(time))
     error = np.einsum("nij,nj->ni", truth.body_to_ned, imu.to_numpy()[:, :3])
     error[:, 2] += 9.80665
     error -= simulation.motion.compute_true_state(time).acceleration_m_s2
@@ -180,7 +181,7 @@ def test_simulated_imu_noise_averaged_over_dt_equals_sigma_a(texts):
 def test_simulated_imu_biases_are_constant_with_requested_sigma():
     simulation = simulate(Scenario(seed=9))
     imu = to_flight(simulation).imu
-    truth = compute_attitude(simulation.motion.compute_true_state(imu.index.to_numpy()))
+    truth = compute_attitude_and_imu(simulation.motion.compute_true_state(imu.index.to_numpy()))
     truth_values = make_answer_key(simulation)["truth"]
     bias = imu.to_numpy()[:, :3].astype(float) - truth.specific_force_m_s2
     assert bias.mean(axis=0) == pytest.approx(truth_values["accelerometer_bias_m_s2"], abs=0.025)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from px4fuse.diagnose import diagnose_comparison
 from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
 from px4fuse.ekf2.model import prepare_ekf2_model
-from px4fuse.ekf2.replay import Agreement
+from px4fuse.ekf2.replay import ReplayAgreement
 from px4fuse.filter.consistency import compute_nis_band
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
@@ -38,7 +38,7 @@ def fused(flight: Flight, axis: str = "north") -> pd.DataFrame:
     return frame.loc[start:end]
 
 
-def agreement(flight: Flight) -> Agreement:
+def agreement(flight: Flight) -> ReplayAgreement:
     model = prepare_ekf2_model(flight)
     return model.agreement
 
@@ -196,7 +196,7 @@ def test_simulated_ekf2_ignores_samples_with_older_timestamps():
     taken = topics["estimator_aid_src_ev_pos"]["timestamp_sample"].astype(np.int64)
     assert np.any(np.diff(sent) < 0)
     assert np.all(np.diff(taken) > 0)
-    rows = ekf2._select_positions(simulation.positions)
+    rows = ekf2._select_accepted_positions(simulation.positions)
     assert len(rows.timestamp_s) < len(sent)
     assert np.all(np.diff(rows.timestamp_s) > 0)
 

@@ -30,14 +30,20 @@ from px4fuse.findings import (
     source_values,
 )
 from px4fuse.findings.model import finding, group_by_cause
-from px4fuse.flight.model import REPEATED_TIMESTAMPS_NOTE, ClockMap, Columns, Flight, Unavailable
+from px4fuse.flight.model import (
+    REPEATED_TIMESTAMPS_NOTE,
+    ClockConversion,
+    Columns,
+    Flight,
+    Unavailable,
+)
 from px4fuse.readers import read_log
 from px4fuse.readers.common import classify_invalid_positions, estimate_quantisation_step
 from px4fuse.readers.position_file import read_position_file
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.scenario import Scenario
-from px4fuse.trajectory.rotation import interpolate, to_matrix
+from px4fuse.trajectory.rotation import interpolate, to_rotation_matrix
 
 LAST = {"tracking_lost", "exact_zeros", "nan_rows", "quality_low", "ekf2_own_back", "two_senders"}
 CASES = sorted(
@@ -144,7 +150,7 @@ def test_read_log_detects_unit_and_clock_of_timestamps(tmp_path, stamp, clock):
     ("milliseconds", "Set timestamp_sample to the time of measurement"),
 ])  # fmt: skip
 def test_action_for_wrong_timestamps_depends_on_clock_or_unit(clock, action):
-    (finding,) = source_stamps.detect_timestamp_unit(
+    (finding,) = source_stamps.detect_wrong_timestamp_unit_or_clock(
         compare(simulate_flight(Scenario(passes=1))), clock
     )
     assert action in finding.remedy
@@ -232,7 +238,7 @@ def without_rows(flight: Flight, reason: str) -> Flight:
 
 
 def with_clock(flight: Flight, name: str, note: str = "", distinct: int | None = None) -> Flight:
-    clock = ClockMap(name, "arrival time", 600, 0.0, 0.0, 0.0, note, distinct)
+    clock = ClockConversion(name, "arrival time", 600, 0.0, 0.0, 0.0, note, distinct)
     return with_track(flight, clock_map=clock)
 
 
@@ -344,7 +350,7 @@ def mounted(
     flight = simulate_flight(scenario, parse_faults(()))
     source, attitude = flight.positions[0], flight.truth.attitude
     time = source.samples.index.to_numpy()
-    rotation = to_matrix(interpolate(time, attitude.index.to_numpy(), attitude.to_numpy()))
+    rotation = to_rotation_matrix(interpolate(time, attitude.index.to_numpy(), attitude.to_numpy()))
     samples = source.samples.copy()
     samples[Columns.POSITION] += rotation @ [*arm_m, 0.0]
     turn = Rotation.from_euler("z", rotation_deg, degrees=True)

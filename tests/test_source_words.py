@@ -34,7 +34,7 @@ def test_report_text_names_only_sensors_of_the_source_kind(words, kinds) -> None
 def test_report_text_exists_for_each_position_source_kind() -> None:
     for kind in PositionKind.__args__:
         source = SimpleNamespace(origin=SimpleNamespace(kind=kind))
-        assert find_source_texts(source) is SOURCE_TEXTS[kind]  # type: ignore[arg-type]
+        assert find_source_texts(SimpleNamespace(source=source)) is SOURCE_TEXTS[kind]  # type: ignore[arg-type]
 
 
 def test_fault_detectors_contain_no_sensor_specific_words() -> None:

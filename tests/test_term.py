@@ -14,11 +14,11 @@ from class_tools import make_report, skip_verification, write_zip
 from golden_tools import assert_matches_golden
 
 from px4fuse.classroom.assignment.key import AnswerKey, CorrectAnswers
-from px4fuse.classroom.assignment.roster import read_people, read_sheet
+from px4fuse.classroom.assignment.roster import read_csv_sheet, read_people
 from px4fuse.classroom.grading.entries import Course, parse_due_time, parse_late_rule
 from px4fuse.classroom.grading.grade import GradeOutcome, grade
 from px4fuse.classroom.grading.model import Grade
-from px4fuse.classroom.grading.rubric import read_rubric, rubric_text
+from px4fuse.classroom.grading.rubric import read_default_rubric_text, read_rubric
 
 STUDENTS = range(1, 41)
 MOODLE, CANVAS, BLACKBOARD = range(1, 16), range(16, 28), range(28, 39)  # 39 and 40 submit nothing
@@ -87,7 +87,7 @@ class Lab:
         rows = [[student_id(n), first(n), last(n), f"s{n}@x.edu"] for n in STUDENTS]
         roster = table(folder / "roster.csv", ["id", "first name", "last name", "email"], rows)
         self.sheets = [self.worksheet(), self.gradebook(), self.grades()]
-        self.roster = read_people(read_sheet(roster))
+        self.roster = read_people(read_csv_sheet(roster))
 
     def moodle(self) -> Path:
         files = {f"{name(n)}_{9000 + n}_assignsubmission_file_/report.pdf": self.pdf[n]
@@ -134,7 +134,7 @@ class Lab:
     def grade(self, rubric=None) -> GradeOutcome:
         due = parse_due_time("2026-11-20 12:00:00 Europe/Berlin")
         course = Course(rubric or read_rubric(None), self.key, [self.logs], "Lab", self.roster,
-                        tuple(map(read_sheet, self.sheets)), due=due,
+                        tuple(map(read_csv_sheet, self.sheets)), due=due,
                         late_rule=parse_late_rule("10%/day"),
                         anonymous=True)  # fmt: skip
         return grade(self.exports, course, self.output, processes=1)
@@ -177,7 +177,9 @@ def check_golden_tables(output: Path) -> None:
 
 
 def check_other_rubric(lab: Lab, outcome: GradeOutcome) -> None:
-    doubled = re.sub(r"(?m)^points = (\d+)", lambda m: f"points = {2 * int(m[1])}", rubric_text())
+    doubled = re.sub(
+        r"(?m)^points = (\d+)", lambda m: f"points = {2 * int(m[1])}", read_default_rubric_text()
+    )
     (lab.folder / "lab.toml").write_text(doubled, encoding="utf-8")
     second = lab.grade(read_rubric(lab.folder / "lab.toml"))
     assert second.reused_count == 38  # two files are not reports

@@ -12,7 +12,7 @@ from ulog_tools import GENERATIONS, make_log, position, seconds_of, take
 
 from px4fuse.readers.ulog_topics import (
     find_longest_increasing_subsequence,
-    measurement_time_us,
+    get_measurement_times_us,
     read_topics,
 )
 
@@ -73,7 +73,7 @@ PUBLISHED = [10_000_000, 11_000_000, 12_000_000, 13_000_000]
     ),
 ])  # fmt: skip
 def test_measurement_time_is_timestamp_sample_or_else_timestamp(sampled, expected):
-    assert measurement_time_us(table(PUBLISHED, sampled)).tolist() == (expected or sampled)
+    assert get_measurement_times_us(table(PUBLISHED, sampled)).tolist() == (expected or sampled)
 
 
 @pytest.mark.parametrize("generation", GENERATIONS)

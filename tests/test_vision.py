@@ -19,9 +19,10 @@ from exchange import replace
 
 from px4fuse.diagnose import diagnose_comparison, run_what_if
 from px4fuse.ekf2 import steps
-from px4fuse.ekf2.filter_recursion import FilterConfiguration, SegmentRun, run_segment
+from px4fuse.ekf2.filter_batch import FilterConfiguration
+from px4fuse.ekf2.filter_recursion import SegmentRun, run_segment
 from px4fuse.ekf2.inputs import ReceivedPositions, ReplayInputs
-from px4fuse.ekf2.intervals import StepEvents, make_event_intervals
+from px4fuse.ekf2.intervals import FusionEvents, make_event_intervals
 from px4fuse.ekf2.model import (
     Ekf2Model,
     list_modelled_aids,
@@ -114,7 +115,7 @@ class PlainBias:
 
 
 def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
-    inputs: ReplayInputs, segment: ReplaySegment, events: StepEvents
+    inputs: ReplayInputs, segment: ReplaySegment, events: FusionEvents
 ) -> tuple[np.ndarray, np.ndarray]:
     """Run a plain EKF: one prediction at a time, each fix and each vision sample at its step.
 
@@ -557,8 +558,10 @@ def test_ekf2_model_excludes_vision_that_disagrees_with_log(wrong: dict[str, Any
     assert not found.agreement.good
     assert found.inputs.vision_positions is None
     assert "ev_pos" not in list_modelled_aids(found.inputs)
+    # the message names the first of several parameters without effect
+    change = {"EKF2_EVP_NOISE": 0.3, "EKF2_EVP_GATE": 5.0, "EKF2_EV_DELAY": 0.0}
     with pytest.raises(SettingsError, match="EKF2_EVP_NOISE has no effect in a replay of this log"):
-        list(replay_with_settings(found, [{"EKF2_EVP_NOISE": 0.3}]))
+        list(replay_with_settings(found, [change, {"EKF2_EV_POS_X": 0.1}]))
 
 
 def test_ekf2_model_does_not_fuse_vision_while_disabled() -> None:
@@ -591,13 +594,19 @@ def test_kf_ekf2_difference_is_partly_explained_by_vision() -> None:
     for why in found.values():
         names = [step.name for step in why.steps]
         assert (
-            names.index(steps.GNSS_VELOCITY_PROPERTY)
-            < names.index(steps.VISION_PROPERTY)
-            < names.index(steps.REJECTION_PROPERTY)
+            names.index(steps.GNSS_VELOCITY_REPLACEMENT_NAME)
+            < names.index(steps.VISION_REPLACEMENT_NAME)
+            < names.index(steps.REJECTION_REPLACEMENT_NAME)
         )
         assert why.unexplained_fraction < 0.05
         moved_m = {step.name: step.position_moved_m for step in why.steps}
-        assert min(moved_m[steps.GNSS_VELOCITY_PROPERTY], moved_m[steps.VISION_PROPERTY]) > 0.05
+        assert (
+            min(
+                moved_m[steps.GNSS_VELOCITY_REPLACEMENT_NAME],
+                moved_m[steps.VISION_REPLACEMENT_NAME],
+            )
+            > 0.05
+        )
     analysis = diagnose_comparison(compare(flown(), Settings(0.27, 0.4)))
     # the noise of vision does not lead to a remedy for GNSS noise
     assert analysis.source.name == "vehicle_visual_odometry"

@@ -181,7 +181,7 @@ def test_output_to_locked_file_advises_to_close_the_program(tmp_path, monkeypatc
     path.write_bytes(b"old")
     at_rename_to(path, monkeypatch, deny)
     for locks, said in ((True, "Close the program that has the file open, or c"), (False, "C")):
-        monkeypatch.setattr(writing, "LOCKS_OPEN_FILES", locks)
+        monkeypatch.setattr(writing, "OPERATING_SYSTEM_LOCKS_OPEN_FILES", locks)
         with pytest.raises(OutputError, match=rf"\. {said}hoose another"):
             write_output_files({path: b"new"})
         assert path.read_bytes() == b"old"

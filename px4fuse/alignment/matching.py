@@ -80,7 +80,7 @@ class AlignmentProblem:
 
 
 @dataclass(frozen=True)
-class Match:
+class TrackMatch:
     """Best fit of a position file to a reference track.
 
     Attributes
@@ -123,7 +123,7 @@ class Match:
         )
 
 
-def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
+def find_match(flight: Flight, problem: AlignmentProblem) -> TrackMatch | None:
     """Match a position file with EKF2's position or, if this fails, with the IMU.
 
     If the user gave time offset, frame and yaw, the match only checks these parameters. Return None
@@ -135,14 +135,13 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
         The user did not give all parameters, and the missing ones cannot be estimated, because the
         file matches neither EKF2's position nor the IMU.
     """
+    is_missing_by_option = {
+        "clock_offset_s": problem.lag_s is None,
+        "frame": len(problem.frames) != 1,
+        "yaw_deg": problem.yaw_rad is None,
+    }
     missing_options = [
-        f"`{name}`"
-        for name, is_missing in (
-            ("clock_offset_s", problem.lag_s is None),
-            ("frame", len(problem.frames) != 1),
-            ("yaw_deg", problem.yaw_rad is None),
-        )
-        if is_missing
+        f"`{name}`" for name, is_missing in is_missing_by_option.items() if is_missing
     ]
     reasons = []
     for make_references in (make_ekf2_references, make_imu_references):
@@ -154,53 +153,61 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
             # All parameters are from the user. The IMU is not accurate enough to check them
             if not missing_options:
                 return None
+            # With a remedy, the file matches this reference but one parameter is ambiguous. The IMU
+            # determines the parameters less accurately than EKF2's position
             if error.remedy:
                 raise
             reasons.append(error.reason)
     raise NoMatchError("; ".join(dict.fromkeys(reasons)), f"Give {' and '.join(missing_options)}")
 
 
-def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
+def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) -> TrackMatch:
+    """Return the match with the reference that has the smallest residual."""
     samples = problem.samples
-    yaw_rad = problem.yaw_rad
     if samples.index[-1] - samples.index[0] > MAX_FILE_DURATION_S:
         raise NoMatchError(
             "the position file covers more than one day; shorten the file to the flight"
         )
     frames = problem.frames or (
-        FRAMES_FOR_ESTIMATED_YAW if yaw_rad is None else FRAMES_FOR_GIVEN_YAW
+        FRAMES_FOR_ESTIMATED_YAW if problem.yaw_rad is None else FRAMES_FOR_GIVEN_YAW
     )
     if compute_horizontal_range_m(convert_to_ned(samples, frames[0])) < MIN_MOTION_M:
         raise NoMatchError(
             f"the positions in the file change by less than {MIN_MOTION_M:g} m, too little "
             "for a match"
         )
-    matches = []
-    for reference in references:
-        reference_name = reference.name
-        fits = [(frame, _fit_file_in_frame(problem, reference, frame, yaw_rad)) for frame in frames]
-        fits.sort(key=lambda frame_and_fit: frame_and_fit[1].residual_rms_m)
-        rms_m_by_frame = {frame: fit.residual_rms_m for frame, fit in fits}
-        best_frame, fit = fits[0]
-        fit_with_estimated_yaw = fit
-        if yaw_rad is not None:
-            fit_with_estimated_yaw = _fit_file_in_frame(problem, reference, best_frame, None)
-        is_given_yaw_wrong = is_reliable_fit(fit_with_estimated_yaw, reference_name) and (
-            fit.concordance_correlation
-            < MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference_name]
-            or needs_rotation(fit.horizontal_rms_m, fit_with_estimated_yaw, reference_name)
-        )
-        matches.append(
-            Match(
-                reference,
-                best_frame,
-                rms_m_by_frame,
-                fit,
-                fit_with_estimated_yaw,
-                is_given_yaw_wrong,
-            )
-        )
-    return min(matches, key=lambda match: match.time_offset_fit.residual_rms_m)
+    return min(
+        (_match_with_reference(reference, frames, problem) for reference in references),
+        key=lambda match: match.time_offset_fit.residual_rms_m,
+    )
+
+
+def _match_with_reference(
+    reference: SampledTrack, frames: tuple[str, ...], problem: AlignmentProblem
+) -> TrackMatch:
+    """Fit the file in each frame to a reference, and test the yaw from the user.
+
+    The yaw is wrong if only the fit with an estimated yaw is acceptable, or much better.
+    """
+    yaw_rad = problem.yaw_rad
+    fits = [(_fit_file_in_frame(problem, reference, frame, yaw_rad), frame) for frame in frames]
+    fits.sort(key=lambda fit_and_frame: fit_and_frame[0].residual_rms_m)
+    fit, best_frame = fits[0]
+    fit_with_estimated_yaw = fit
+    if yaw_rad is not None:
+        fit_with_estimated_yaw = _fit_file_in_frame(problem, reference, best_frame, None)
+    is_given_yaw_wrong = is_reliable_fit(fit_with_estimated_yaw, reference.name) and (
+        fit.concordance_correlation < MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference.name]
+        or needs_rotation(fit.horizontal_rms_m, fit_with_estimated_yaw, reference.name)
+    )
+    return TrackMatch(
+        reference,
+        best_frame,
+        {frame: fit.residual_rms_m for fit, frame in fits},
+        fit,
+        fit_with_estimated_yaw,
+        is_given_yaw_wrong,
+    )
 
 
 def needs_rotation(
@@ -221,7 +228,7 @@ def is_reliable_fit(fit: TrackFit, reference: str) -> bool:
     )
 
 
-def _require_unique_match(match: Match) -> None:
+def _require_unique_match(match: TrackMatch) -> None:
     reference_name = match.reference.name
     fit = match.time_offset_fit
     if fit.concordance_correlation < MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference_name]:
@@ -258,9 +265,14 @@ def _require_unique_match(match: Match) -> None:
             )
 
 
-def _refit_without_origin_resets(flight: Flight, match: Match, problem: AlignmentProblem) -> Match:
-    ekf2 = flight.ekf2
-    fit = match.time_offset_fit
+def _refit_without_origin_resets(
+    flight: Flight, match: TrackMatch, problem: AlignmentProblem
+) -> TrackMatch:
+    """Fit again to EKF2's position without resets that only moved the origin of its frame.
+
+    The first match gives the position of the file at each reset, which is needed to find these.
+    """
+    ekf2, fit = flight.ekf2, match.time_offset_fit
     if match.reference.name == IMU_REFERENCE or isinstance(ekf2, Unavailable) or not ekf2.resets:
         return match
     aligned_samples = align_samples(
@@ -273,8 +285,10 @@ def _refit_without_origin_resets(flight: Flight, match: Match, problem: Alignmen
         ekf2_track,
         is_lag_estimated=problem.lag_s is None,
     )
-    fit_with_estimated_yaw = refit(match.fit_with_estimated_yaw, None)
-    fit = fit_with_estimated_yaw if problem.yaw_rad is None else refit(match.fit, problem.yaw_rad)
+    # Each fit starts at the lag of its predecessor
+    fit = fit_with_estimated_yaw = refit(match.fit_with_estimated_yaw, yaw_rad=None)
+    if problem.yaw_rad is not None:
+        fit = refit(match.fit, yaw_rad=problem.yaw_rad)
     return replace(
         match, reference=ekf2_track, fit=fit, fit_with_estimated_yaw=fit_with_estimated_yaw
     )
@@ -283,8 +297,8 @@ def _refit_without_origin_resets(flight: Flight, match: Match, problem: Alignmen
 def _fit_file_in_frame(
     problem: AlignmentProblem, reference: SampledTrack, frame: str, yaw_rad: float | None
 ) -> TrackFit:
+    """Fit the file in a frame to a reference; estimate the lag if the user gave none."""
     file_track = convert_to_ned(problem.samples, frame)
-    lag_s = problem.lag_s
     grid_track = resample_to_grid(remove_spikes(file_track))
     if reference.name == IMU_REFERENCE:
         if len(grid_track.time_s) * GRID_STEP_S < MIN_OVERLAP_S:
@@ -292,12 +306,13 @@ def _fit_file_in_frame(
                 f"the position file is shorter than {MIN_OVERLAP_S:g} s, too short for a "
                 "match with the IMU"
             )
+        # make_imu_references filters twice: velocity and position. Filter the file equally
         position_m = apply_band_pass(apply_band_pass(grid_track.position_m))
         file_track = grid_track = mark_transients(replace(grid_track, position_m=position_m))
-    if lag_s is None:
+    if problem.lag_s is None:
         peak = find_correlation_peak(grid_track, reference, yaw_rad)
     else:
-        peak = CorrelationPeak(lag_s)
+        peak = CorrelationPeak(problem.lag_s)
     return fit_by_least_squares(
-        file_track, reference, peak, yaw_rad, is_lag_estimated=lag_s is None
+        file_track, reference, peak, yaw_rad, is_lag_estimated=problem.lag_s is None
     )

@@ -15,7 +15,7 @@ from msgspec import structs
 from px4fuse.alignment.matching import (
     MIN_CONCORDANCE_CORRELATION_WITHOUT_WARNING,
     AlignmentProblem,
-    Match,
+    TrackMatch,
     find_match,
     is_reliable_fit,
     needs_rotation,
@@ -34,9 +34,9 @@ from px4fuse.alignment.tracks import (
     make_continuous_ekf2_track,
 )
 from px4fuse.convention.axes import MAX_TIME_OFFSET_S, METRES_PER_UNIT
-from px4fuse.convention.check import check_convention
+from px4fuse.convention.check import determine_source_convention
 from px4fuse.convention.correction import MIN_FRAME_ROTATION_DEG
-from px4fuse.convention.texts import FRAME_AXES, UNIT_NAMES, describe_axes, describe_unit
+from px4fuse.convention.texts import FRAME_AXES, UNIT_NAMES, describe_axes, describe_wrong_unit
 from px4fuse.core.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight.model import (
@@ -63,28 +63,38 @@ def _explain_mismatch(
 ) -> tuple[str, str] | None:
     """Return error message and advice if the IMU shows wrong axes or a wrong unit of the file."""
     samples = problem.samples
+    # The log can begin or end at any time of the file, so offsets up to the longer span are tested
     span_s = max(samples.index[-1] - samples.index[0], flight.log.duration_s)
     if span_s > MAX_CONVENTION_CHECK_SPAN_S:
         return None
     time_s = samples.index - samples.index[0] + (problem.lag_s or 0.0)
     positions = samples[["x_m", "y_m", "z_m"]].to_numpy() / metres_per_unit
     position_samples = pd.DataFrame(positions, time_index(time_s.to_numpy()), Columns.POSITION)
+    # The check uses only the positions of this track
     track = PositionTrack("", POSITION_FILE_ORIGIN, "", position_samples, "unknown", "", ())
     max_time_offset_s = span_s if problem.lag_s is None else MAX_TIME_OFFSET_S
-    convention = check_convention(flight, track, max_time_offset_s)
+    convention = determine_source_convention(flight, track, max_time_offset_s)
     if convention is None or convention.verdict != "determined":
         return None
-    axes, faults = convention.axes, []
+    faults = []
     if METRES_PER_UNIT[convention.unit] != metres_per_unit:
         stated_unit = next(
             name for unit, name in UNIT_NAMES.items() if METRES_PER_UNIT[unit] == metres_per_unit
         )
-        faults.append(describe_unit(convention.unit, "the positions", stated_unit, is_file=True))
-    stated_frame = problem.frames[0].upper() if len(problem.frames) == 1 else ""
-    is_rotated = abs(convention.rotation_deg) > MIN_FRAME_ROTATION_DEG
-    if stated_frame and axes != FRAME_AXES[stated_frame] and not is_rotated:
         faults.append(
-            describe_axes(axes, stated_frame, is_mirrored=convention.is_mirrored, is_file=True)
+            describe_wrong_unit(convention.unit, "the positions", stated_unit, is_file=True)
+        )
+    stated_frame = problem.frames[0].upper() if len(problem.frames) == 1 else ""
+    # The axes are multiples of 90°: with another rotation, they do not contradict the stated frame
+    is_rotated = abs(convention.rotation_deg) > MIN_FRAME_ROTATION_DEG
+    if stated_frame and convention.axes != FRAME_AXES[stated_frame] and not is_rotated:
+        faults.append(
+            describe_axes(
+                convention.axes,
+                stated_frame,
+                is_mirrored=convention.is_mirrored,
+                is_file=True,
+            )
         )
     if not faults:
         return None
@@ -129,10 +139,10 @@ def align_position_file(
         An omitted option cannot be estimated, or file and log do not overlap in time.
     """
     _check_options(frame, yaw_deg, clock_offset_s)
-    samples = select_valid_rows(recording.samples, ["x_m", "y_m"])
+    samples, name = select_valid_rows(recording.samples, ["x_m", "y_m"]), recording.name
     if len(samples) < MIN_MATCHED_SAMPLES:
         raise MissingDataError(
-            f"{recording.name} contains {len(samples)} positions; {MIN_MATCHED_SAMPLES} are needed",
+            f"{name} contains {len(samples)} positions; {MIN_MATCHED_SAMPLES} are needed",
             "Check that the position file contains the whole flight.",
         )
     start_s, end_s = samples.index[[0, -1]].tolist()
@@ -142,10 +152,11 @@ def align_position_file(
         f"clock, the position file from {start_s:.2f} s to {end_s:.2f} s on a "
         f"{recording.clock_kind} clock"
     )
+    # Flight time of the first position of the file
     lag_s = None if clock_offset_s is None else start_s + clock_offset_s - boot_time_s
     if lag_s is not None and not start_s - end_s <= lag_s <= duration_s:
         raise MissingDataError(
-            f"{recording.name}: with --clock-offset {clock_offset_s:.3f} the file does not "
+            f"{name}: with --clock-offset {clock_offset_s:.3f} the file does not "
             f"overlap the log ({spans_text})",
             "Correct or omit --clock-offset.",
         )
@@ -155,30 +166,39 @@ def align_position_file(
         match = find_match(flight, problem)
     except NoMatchError as error:
         if fault := _explain_mismatch(flight, problem, recording.metres_per_unit):
-            raise MissingDataError(f"{recording.name}: {fault[0]}.", fault[1]) from None
+            raise MissingDataError(f"{name}: {fault[0]}.", fault[1]) from None
         raise MissingDataError(
-            f"{recording.name}: {error.reason}; {spans_text}", f"{error.remedy}."
+            f"{name}: {error.reason}; {spans_text}", f"{error.remedy}."
         ) from None
     if frame:
         frame_reason = "the frame was given with --position-frame"
+    elif match and len(problem.frames) != 1:
+        frame_reason = (
+            f"{match.frame} is the tested frame with the smallest residual against the "
+            f"{match.reference.name} ({match.residuals_text})"
+        )
     elif recording.format:
         frame_reason = f"the format {recording.format} defines the frame"
     else:
         frame_reason = "the column names of the position file contain the axis directions"
-    yaw_reason = "the yaw was given with --position-yaw"
     if yaw_deg is None:
         yaw_reason = "without --position-yaw, px4fuse does not rotate the positions"
+    elif match and yaw_rad is None:
+        yaw_reason = f"the yaw was estimated with the {match.reference.name}"
+    else:
+        yaw_reason = "the yaw was given with --position-yaw"
     alignment, aligned_samples = _apply_alignment(
         flight, recording, problem, match, frame_reason, yaw_reason, clock_offset_s
     )
     offset_method = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
     invalid_reasons, sample_count = recording.reason_by_invalid_row, len(recording.samples)
+    # A clock map, which reports repeated timestamps, already counts the dropped rows
     clock_map = describe_repeated_timestamps(
         recording.clock_kind, sample_count + recording.dropped_row_count, sample_count
     )
     track = PositionTrack(
-        name=recording.name,
+        name=name,
         origin=POSITION_FILE_ORIGIN,
         description=f"position file with {len(aligned_samples)} samples in the frame "
         f"{alignment.frame}{rotation_text}",
@@ -186,8 +206,8 @@ def align_position_file(
         frame="NED",
         clock=f"{recording.clock_kind} clock of the position file; boot clock minus this clock: "
         f"{alignment.clock_offset_s:+.3f} s ({offset_method})",
-        topics=(recording.name,),
-        log=recording.name,
+        topics=(name,),
+        log=name,
         alignment=alignment,
         clock_map=clock_map,
         invalid_reasons=invalid_reasons.set_axis(
@@ -195,19 +215,16 @@ def align_position_file(
         ),
         quantisation_step_m=recording.quantisation_step_m,
     )
-    notes = [
-        f"{recording.name}: {text}"
-        for text in (*recording.format_detection_notes, *recording.notes)
-    ]
+    notes = [f"{name}: {text}" for text in (*recording.format_detection_notes, *recording.notes)]
     log = flight.log
     dropped_counts = dict(log.dropped)
     if recording.dropped_row_count and not clock_map:
-        dropped_counts[recording.name] = recording.dropped_row_count
+        dropped_counts[name] = recording.dropped_row_count
     return replace(
         flight,
         log=structs.replace(log, notes=(*log.notes, *notes), dropped=dropped_counts),
         positions=(track, *flight.positions),
-        inputs=(InputFile(recording.name, recording.sha256, recording.size_bytes, "position"),),
+        inputs=(InputFile(name, recording.sha256, recording.size_bytes, "position"),),
     )
 
 
@@ -230,60 +247,55 @@ def _apply_alignment(
     flight: Flight,
     recording: PositionRecording,
     problem: AlignmentProblem,
-    match: Match | None,
+    match: TrackMatch | None,
     frame_reason: str,
     yaw_reason: str,
     clock_offset_s: float | None,
 ) -> tuple[Alignment, pd.DataFrame]:
-    samples = problem.samples
-    frame = problem.frames[0] if problem.frames else ""
-    is_yaw_estimated = problem.yaw_rad is None
-    yaw_rad = problem.yaw_rad or 0.0
-    lag_s = problem.lag_s or 0.0
+    """Convert the positions of the file, and compare them with EKF2's position.
+
+    Yaw and time offset are those of the user or, if the user gave none, those of the match. Without
+    a match, the user gave all parameters.
+    """
+    boot_time_s, is_yaw_estimated = flight.log.boot_time_s, problem.yaw_rad is None
+    frame = match.frame if match else problem.frames[0]
+    reference_name = match.reference.name if match else ""
+    yaw_rad, lag_s, origin_m = problem.yaw_rad or 0.0, problem.lag_s or 0.0, np.zeros(3)
     yaw_sigma_deg = time_offset_sigma_s = reference_correlation = residual_rms_m = None
-    origin_m = np.zeros(3)
-    reference_name = ""
+    if match and is_yaw_estimated:
+        yaw_rad = match.fit.yaw_rad
+        yaw_sigma_deg = float(np.degrees(match.fit.yaw_sigma_rad or 0.0))
+        if reference_name == EKF2_REFERENCE:  # the IMU does not determine the origin
+            origin_m = match.fit.origin_m
     time_offset_reason = "the offset was given with --clock-offset"
+    if match and clock_offset_s is None:
+        lag_s = match.time_offset_fit.lag_s
+        time_offset_sigma_s = match.time_offset_fit.lag_sigma_s
+        clock_offset_s = lag_s + (boot_time_s - problem.samples.index[0])
+        time_offset_reason = (
+            f"the position file was matched in time with the {reference_name}; the time offset "
+            f"includes any delay of the {reference_name}"
+        )
     if match:
-        frame = match.frame
-        reference_name = match.reference.name
-        if len(problem.frames) != 1:
-            frame_reason = (
-                f"{frame} is the tested frame with the smallest residual against the "
-                f"{reference_name} ({match.residuals_text})"
-            )
-            if is_yaw_estimated and frame == "enu":
-                frame_reason += "; nwu was not tested, because it is enu with another yaw"
-        if is_yaw_estimated:
-            yaw_rad = match.fit.yaw_rad
-            yaw_sigma_deg = float(np.degrees(match.fit.yaw_sigma_rad or 0.0))
-            yaw_reason = f"the yaw was estimated with the {reference_name}"
-            origin_m = match.fit.origin_m if reference_name == EKF2_REFERENCE else origin_m
-        if clock_offset_s is None:
-            lag_s = match.time_offset_fit.lag_s
-            time_offset_sigma_s = match.time_offset_fit.lag_sigma_s
-            clock_offset_s = lag_s + (flight.log.boot_time_s - samples.index[0])
-            time_offset_reason = (
-                f"the position file was matched in time with the {reference_name}; the time offset "
-                f"includes any delay of the {reference_name}"
-            )
         reference_correlation = float(
             (np.exp(-1j * yaw_rad) * match.time_offset_fit.coherence).real
         )
-    aligned_samples = align_samples(samples, frame, yaw_rad, origin_m, lag_s)
-    ekf2_comparison = (
-        None if reference_name == IMU_REFERENCE else _compare_with_ekf2(flight, aligned_samples)
-    )
+    aligned_samples = align_samples(problem.samples, frame, yaw_rad, origin_m, lag_s)
     distance_to_ekf2_m = None
-    if ekf2_comparison:
+    # EKF2 did not match a file that was matched with the IMU
+    if reference_name != IMU_REFERENCE and (
+        ekf2_comparison := _compare_with_ekf2(flight, aligned_samples)
+    ):
         reference_name = EKF2_REFERENCE
         distance_to_ekf2_m, reference_correlation = ekf2_comparison
         residual_rms_m = float(np.sqrt(np.mean(distance_to_ekf2_m**2) / 2.0))
-    frame_conflict, warnings = "", [*_find_warnings(match, is_yaw_estimated)] if match else []
-    if match and not is_yaw_estimated:
-        frame_conflict = _describe_frame_conflict(match, distance_to_ekf2_m, yaw_rad)
+    frame_conflict, warnings = "", list[str]()
+    if match:
+        warnings += _find_warnings(match, is_yaw_estimated)
+        if not is_yaw_estimated:
+            frame_conflict = _describe_frame_conflict(match, distance_to_ekf2_m, yaw_rad)
     if (
-        ekf2_comparison
+        distance_to_ekf2_m is not None
         and not (is_yaw_estimated or frame_conflict)
         and reference_correlation is not None
         and reference_correlation < MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[EKF2_REFERENCE]
@@ -294,7 +306,7 @@ def _apply_alignment(
         )
     unix_start_s = flight.log.start_unix_s
     if recording.clock_kind == "UNIX" and unix_start_s is not None and clock_offset_s is not None:
-        unix_time_difference_s = abs(flight.log.boot_time_s - clock_offset_s - unix_start_s)
+        unix_time_difference_s = abs(boot_time_s - clock_offset_s - unix_start_s)
         if unix_time_difference_s >= MAX_UNIX_CLOCK_DIFFERENCE_S:
             warnings.append(
                 f"The UNIX times of position file and log differ by {unix_time_difference_s:.0f} "
@@ -344,23 +356,28 @@ def _compare_with_ekf2(
     return distance_to_ekf2_m, float(np.sum(file_position_m * ekf2_position_m) / norm_product)
 
 
-def _describe_frame_conflict(match: Match, distance_to_ekf2_m: Array | None, yaw_rad: float) -> str:
-    reference_name = match.reference.name
-    fit = match.fit_with_estimated_yaw
-    is_rotated = match.is_given_yaw_wrong
-    shift_text, shift_m = "", 0.0
+def _describe_frame_conflict(
+    match: TrackMatch, distance_to_ekf2_m: Array | None, yaw_rad: float
+) -> str:
+    """Describe a frame that is rotated against the reference; empty without such a rotation.
+
+    EKF2 shows rotation and origin of the frame, the IMU only the rotation.
+    """
+    reference_name, fit = match.reference.name, match.fit_with_estimated_yaw
+    yaw_deg = np.degrees(np.angle(np.exp(1j * (fit.yaw_rad - yaw_rad))))
+    is_rotated, shift_text = match.is_given_yaw_wrong, ""
     if distance_to_ekf2_m is not None:
+        # Residual per horizontal axis, like TrackFit.horizontal_rms_m
         residual_m = compute_clipped_rms_m(distance_to_ekf2_m) / np.sqrt(2.0)
-        is_rotated = is_reliable_fit(fit, reference_name) and needs_rotation(
-            residual_m, fit, reference_name
-        )
         shift_m = np.hypot(*fit.origin_m[:2])
+        is_rotated = (
+            is_reliable_fit(fit, reference_name)
+            and needs_rotation(residual_m, fit, reference_name)
+            # GNSS determines EKF2's origin only to about 1 m
+            and (abs(yaw_deg) >= MIN_REPORTED_YAW_DEG or shift_m >= MIN_REPORTED_SHIFT_M)
+        )
         shift_text = f"The position file has its origin {shift_m:.1f} m from EKF2's origin. "
     if not is_rotated:
-        return ""
-    yaw_deg = np.degrees(np.angle(np.exp(1j * (fit.yaw_rad - yaw_rad))))
-    # GNSS determines EKF2's origin only to about 1 m
-    if shift_text and abs(yaw_deg) < MIN_REPORTED_YAW_DEG and shift_m < MIN_REPORTED_SHIFT_M:
         return ""
     return (
         f"The frame of the position file is rotated by {yaw_deg:.1f}° relative to the "
@@ -368,7 +385,7 @@ def _describe_frame_conflict(match: Match, distance_to_ekf2_m: Array | None, yaw
     )
 
 
-def _find_warnings(match: Match, is_yaw_estimated: bool) -> Iterator[str]:
+def _find_warnings(match: TrackMatch, is_yaw_estimated: bool) -> Iterator[str]:
     reference_name = match.reference.name
     fit = match.time_offset_fit
     if fit.concordance_correlation < MIN_CONCORDANCE_CORRELATION_WITHOUT_WARNING[reference_name]:

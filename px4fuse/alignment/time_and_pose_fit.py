@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import label
 from scipy.optimize import least_squares
 
 from px4fuse.alignment.tracks import (
@@ -26,6 +27,9 @@ MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH = {EKF2_REFERENCE: 0.7, IMU_REFERENC
 MIN_CONCORDANCE_DEFICIT = 1e-4
 # Lags within this time (s) of the best lag may belong to the same correlation peak
 MIN_PEAK_DISTANCE_S = 3.0
+# A second peak needs at least this fraction of the common samples, and of the sum of squared
+# positions, at the best lag: a match of few samples, or of samples at rest, is no evidence
+MIN_SECOND_PEAK_SAMPLE_FRACTION, MIN_SECOND_PEAK_SQUARE_SUM_FRACTION = 0.5, 0.25
 # Error (m) of the interpolation of positions to the time grid
 INTERPOLATION_ERROR_M = 0.05
 # In the RMS, larger position residuals (m) count as this value, because they may be outliers
@@ -105,8 +109,7 @@ def find_correlation_peak(
     moments_by_lag = compute_moments(
         file_track.to_complex_m(), reference.to_complex_m(), file_track.is_valid, reference.is_valid
     )
-    common_sample_counts = moments_by_lag.count
-    covariance = moments_by_lag.covariance
+    common_sample_counts, covariance = moments_by_lag.count, moments_by_lag.covariance
     square_sum_m2 = moments_by_lag.sum_of_squares_a + moments_by_lag.sum_of_squares_b
     has_overlap = common_sample_counts >= min_sample_count
     # If the vehicle is at rest in both tracks, the sum of squares is only a rounding error
@@ -115,30 +118,34 @@ def find_correlation_peak(
         np.abs(covariance) if yaw_rad is None else (np.exp(-1j * yaw_rad) * covariance).real
     )
     concordance_correlation = np.zeros_like(square_sum_m2)
-    concordance_correlation[has_overlap] = (
-        2.0 * rotated_covariance[has_overlap] / square_sum_m2[has_overlap]
+    np.divide(
+        2.0 * rotated_covariance, square_sum_m2, out=concordance_correlation, where=has_overlap
     )
     log_likelihood_gain = -common_sample_counts * np.log(
         np.maximum(1.0 - concordance_correlation, MIN_CONCORDANCE_DEFICIT)
     )
     best_index = int(np.argmax(np.where(has_overlap, log_likelihood_gain, -np.inf)))
 
-    def compute_lag_s(index: int) -> float:
-        return float(reference.time_s[0]) + (index - len(file_track.is_valid) + 1) * GRID_STEP_S
-
-    can_be_second_peak = (
-        has_overlap
-        & (common_sample_counts >= 0.5 * common_sample_counts[best_index])
-        & (square_sum_m2 >= 0.25 * square_sum_m2[best_index])
-        & (concordance_correlation >= MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference.name])
+    peak = CorrelationPeak(
+        float(reference.time_s[0]) + (best_index - len(file_track.is_valid) + 1) * GRID_STEP_S,
+        concordance_correlation[best_index],
     )
     # The best peak ends where the concordance falls below half of its maximum
-    is_high = concordance_correlation >= 0.5 * concordance_correlation[best_index]
-    for indices_from_best in (np.arange(best_index, -1, -1), np.arange(best_index, len(is_high))):
-        near_indices = indices_from_best[: round(MIN_PEAK_DISTANCE_S / GRID_STEP_S) + 1]
-        is_in_best_peak = np.logical_and.accumulate(is_high[near_indices])
-        can_be_second_peak[near_indices[is_in_best_peak]] = False
-    peak = CorrelationPeak(compute_lag_s(best_index), concordance_correlation[best_index])
+    steps_from_best = np.arange(len(covariance)) - best_index
+    region_numbers, _ = label(
+        (np.abs(steps_from_best) <= round(MIN_PEAK_DISTANCE_S / GRID_STEP_S))
+        & (concordance_correlation >= 0.5 * concordance_correlation[best_index])
+    )
+    can_be_second_peak = (
+        has_overlap
+        & (region_numbers != region_numbers[best_index])
+        & (
+            common_sample_counts
+            >= MIN_SECOND_PEAK_SAMPLE_FRACTION * common_sample_counts[best_index]
+        )
+        & (square_sum_m2 >= MIN_SECOND_PEAK_SQUARE_SUM_FRACTION * square_sum_m2[best_index])
+        & (concordance_correlation >= MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference.name])
+    )
     if not can_be_second_peak.any():
         return peak
     mean_square_residual_m2 = np.maximum(square_sum_m2 - 2.0 * rotated_covariance, 0.0) / (
@@ -148,7 +155,7 @@ def find_correlation_peak(
     second_peak_index = int(np.argmin(np.where(can_be_second_peak, residual_m, np.inf)))
     return replace(
         peak,
-        second_peak_lag_difference_s=compute_lag_s(second_peak_index) - compute_lag_s(best_index),
+        second_peak_lag_difference_s=float(steps_from_best[second_peak_index]) * GRID_STEP_S,
         second_to_best_residual_ratio=residual_m[second_peak_index] / residual_m[best_index],
     )
 
@@ -186,8 +193,8 @@ def fit_by_least_squares(
         )
     reference_time_s = file_track.time_s[is_used] + peak.lag_s
     file_position_m = file_track.to_complex_m()[is_used]
-    reference_position_m = (reference_m[:, 0] + 1j * reference_m[:, 1])[is_used]
-    centre_m = np.mean(file_position_m)
+    reference_position_m = reference_m[is_used, 0] + 1j * reference_m[is_used, 1]
+    centre_m, reference_mean_m = file_position_m.mean(), reference_position_m.mean()
     # With centred positions, the errors of yaw and origin are uncorrelated
     file_position_m = file_position_m - centre_m
     file_variance_m2, reference_variance_m2 = np.var(file_position_m), np.var(reference_position_m)
@@ -197,26 +204,25 @@ def fit_by_least_squares(
     reference_horizontal_position_m = reference.to_complex_m()
 
     # Parameters: origin north, origin east (m), lag correction (s), yaw (rad)
-    reference_mean_m = reference_position_m.mean()
-    parameters = np.array([reference_mean_m.real, reference_mean_m.imag, 0.0, np.angle(coherence)])
+    initial_yaw_rad = np.angle(coherence) if yaw_rad is None else yaw_rad
+    parameters = np.array([reference_mean_m.real, reference_mean_m.imag, 0.0, initial_yaw_rad])
     bounds = np.array([np.inf, np.inf, MAX_LAG_CORRECTION_S, np.inf])
     is_fitted = np.array([True, True, is_lag_estimated, yaw_rad is None])
-    if yaw_rad is not None:
-        parameters[3] = yaw_rad
 
     def compute_residuals_m(fitted_parameters: Array) -> Array:
+        """Return the residuals north and east of each position in turn."""
         all_parameters = parameters.copy()
         all_parameters[is_fitted] = fitted_parameters
         origin_north_m, origin_east_m, lag_correction_s, fitted_yaw_rad = all_parameters
-        reference_at_lag_m = np.interp(
+        reference_position_at_lag_m = np.interp(
             reference_time_s + lag_correction_s, reference.time_s, reference_horizontal_position_m
         )
-        residuals = (
+        residuals_m: ComplexArray = (
             np.exp(1j * fitted_yaw_rad) * file_position_m
             + complex(origin_north_m, origin_east_m)
-            - reference_at_lag_m
+            - reference_position_at_lag_m
         )
-        return np.concatenate([residuals.real, residuals.imag])
+        return residuals_m.view(float)
 
     solution = least_squares(
         compute_residuals_m,
@@ -225,40 +231,36 @@ def fit_by_least_squares(
         loss="soft_l1",
         f_scale=_compute_robust_sigma(compute_residuals_m(parameters[is_fitted])),
     )
-    residuals = solution.fun
+    residuals_m = solution.fun.view(complex)
     parameters[is_fitted] = solution.x
+    parameter_sigma = np.full(4, np.nan)
+    parameter_sigma[is_fitted] = _compute_parameter_sigma(np.asarray(solution.jac), residuals_m)
     origin_north_m, origin_east_m, lag_correction_s, fitted_yaw_rad = parameters.tolist()
-    complex_residuals = residuals[: len(file_position_m)] + 1j * residuals[len(file_position_m) :]
-    parameter_sigma = _compute_parameter_sigma(
-        np.asarray(solution.jac), residuals, complex_residuals
-    )
-    lag_sigma_s = float(parameter_sigma[2]) if is_lag_estimated else None
+    _, _, lag_sigma_s, yaw_sigma_rad = parameter_sigma.tolist()
+    # At its limit, the lag is not determined by the data
     if abs(lag_correction_s) > 0.99 * MAX_LAG_CORRECTION_S:
         lag_sigma_s = np.inf
-    reference_ned_m, _ = reference.at(reference_time_s + lag_correction_s)
-    down_difference_m = reference_ned_m[:, 2] - file_track.position_m[is_used, 2]
-    down_difference_m = down_difference_m[np.isfinite(down_difference_m)]
-    horizontal_rms_m = compute_clipped_rms_m(np.abs(complex_residuals)) / np.sqrt(2.0)
-    origin_down_m = vertical_rms_m = 0.0
-    if len(down_difference_m):
-        origin_down_m = float(np.median(down_difference_m))
-        vertical_rms_m = compute_clipped_rms_m(down_difference_m - origin_down_m)
     concordance_correlation = peak.concordance_correlation
-    if np.isnan(concordance_correlation):
+    if np.isnan(concordance_correlation):  # the lag is given: there is no correlation peak
         rotated_covariance_m2 = (np.exp(-1j * fitted_yaw_rad) * covariance_m2).real
         mean_of_variances_m2 = max((file_variance_m2 + reference_variance_m2) / 2.0, 1e-300)
         concordance_correlation = rotated_covariance_m2 / mean_of_variances_m2
     complex_origin_m = (
         complex(origin_north_m, origin_east_m) - np.exp(1j * fitted_yaw_rad) * centre_m
     )
+    horizontal_rms_m = compute_clipped_rms_m(np.abs(residuals_m)) / np.sqrt(2.0)
+    reference_ned_m, _ = reference.at(reference_time_s + lag_correction_s)
+    origin_down_m, vertical_rms_m = _fit_vertical(
+        reference_ned_m[:, 2] - file_track.position_m[is_used, 2]
+    )
     return TrackFit(
         lag_s=peak.lag_s + lag_correction_s,
-        lag_sigma_s=lag_sigma_s,
+        lag_sigma_s=lag_sigma_s if is_lag_estimated else None,
         concordance_correlation=concordance_correlation,
         second_peak_lag_difference_s=peak.second_peak_lag_difference_s,
         second_to_best_residual_ratio=peak.second_to_best_residual_ratio,
         yaw_rad=fitted_yaw_rad,
-        yaw_sigma_rad=float(parameter_sigma[-1]) if yaw_rad is None else None,
+        yaw_sigma_rad=yaw_sigma_rad if yaw_rad is None else None,
         origin_m=np.array([complex_origin_m.real, complex_origin_m.imag, origin_down_m]),
         coherence=coherence,
         horizontal_rms_m=horizontal_rms_m,
@@ -266,17 +268,24 @@ def fit_by_least_squares(
     )
 
 
-def _compute_parameter_sigma(
-    jacobian: Array, residuals: Array, complex_residuals: ComplexArray
-) -> Array:
+def _fit_vertical(down_difference_m: Array) -> tuple[float, float]:
+    """Return the vertical origin (m, down) and the RMS residual (m); zero without heights."""
+    down_difference_m = down_difference_m[np.isfinite(down_difference_m)]
+    if not len(down_difference_m):
+        return 0.0, 0.0
+    origin_down_m = float(np.median(down_difference_m))
+    return origin_down_m, compute_clipped_rms_m(down_difference_m - origin_down_m)
+
+
+def _compute_parameter_sigma(jacobian: Array, residuals_m: ComplexArray) -> Array:
     """Return the standard deviations of the fitted parameters."""
     information = jacobian.T @ jacobian
     # The added diagonal prevents a singular matrix
     information += 1e-9 * np.diag(np.diag(information) + 1e-12)
     parameter_variance = (
         np.diag(np.linalg.inv(information))
-        * _compute_robust_sigma(residuals) ** 2
-        * _compute_autocorrelation_factor(complex_residuals)
+        * _compute_robust_sigma(residuals_m.view(float)) ** 2
+        * _compute_autocorrelation_factor(residuals_m)
     )
     return np.sqrt(np.maximum(parameter_variance, 0.0))
 

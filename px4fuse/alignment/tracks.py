@@ -177,15 +177,17 @@ def make_imu_references(flight: Flight) -> list[SampledTrack]:
         raise NoMatchError(f"the log has no acceleration in NED ({acceleration.reason})")
     time_s = acceleration.index.to_numpy()
     velocity_m_s = integrate_cumulatively(acceleration.to_numpy(), time_s)
-    grid_track = resample_to_grid(_make_gapless_track(time_s, velocity_m_s))
-    if len(grid_track.time_s) * GRID_STEP_S < MIN_OVERLAP_S:
+    # The field position_m of this track holds the velocity (m/s), to resample it to the grid
+    velocity_track = resample_to_grid(_make_gapless_track(time_s, velocity_m_s))
+    grid_s = velocity_track.time_s
+    if len(grid_s) * GRID_STEP_S < MIN_OVERLAP_S:
         raise NoMatchError(f"the IMU data are shorter than {MIN_OVERLAP_S:g} s")
-    position_m = integrate_cumulatively(apply_band_pass(grid_track.position_m), grid_track.time_s)
-    return [
-        mark_transients(
-            replace(grid_track, position_m=apply_band_pass(position_m), name=IMU_REFERENCE)
-        )
-    ]
+    # Each integral drifts, so velocity and position are both filtered
+    position_m = integrate_cumulatively(apply_band_pass(velocity_track.position_m), grid_s)
+    imu_track = SampledTrack(
+        grid_s, apply_band_pass(position_m), velocity_track.is_valid, IMU_REFERENCE
+    )
+    return [mark_transients(imu_track)]
 
 
 def align_samples(

@@ -24,18 +24,18 @@ from px4fuse.diagnose import diagnose_or_check_aids
 from px4fuse.errors import LogError, ResultsError
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import SETTING_RANGES, Settings
-from px4fuse.filter.signals import AISLE
+from px4fuse.filter.signals import AISLE_AXIS
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import make_comparison_or_aids_results, make_results
 from px4fuse.results.contract import (
     AidsResults,
-    ChangeResults,
     ComparisonResults,
     ConfidenceInterval,
     DiffInput,
     DiffInputName,
+    DiffResults,
     NumberChange,
     SettingChange,
     UnsharedFinding,
@@ -57,9 +57,9 @@ COMPARED_NUMBER_DEFINITIONS = [
     for name, label in (FILTER_NAMES.items() if "FILTER" in row["path"] else [("", "")])
 ]
 # px4fuse diff lists a number only if its relative difference between A and B is larger than this
-MAX_OMITTED_RELATIVE_DIFFERENCE = 0.01
+MIN_RELATIVE_DIFFERENCE_OF_LISTED_NUMBERS = 0.01
 # px4fuse diff lists a number only if A and B differ by more than this (in the unit of the number)
-MAX_OMITTED_DIFFERENCE = 0.001
+MIN_DIFFERENCE_OF_LISTED_NUMBERS = 0.001
 
 # Maximum √(mean NEES) of a consistent filter; the minimum is 1 ÷ maximum. The limits are wide,
 # because the errors in a flight are correlated
@@ -106,7 +106,7 @@ class ComparedNumber:
 
 def diff(
     a: str | Path, b: str | Path, *, progress: ProgressCallback = lambda _: None
-) -> ChangeResults:
+) -> DiffResults:
     """List the settings, numbers and findings that differ between A and B.
 
     Parameters
@@ -123,12 +123,12 @@ def diff(
         A file cannot be read or compared, or A and B are the same file.
     """
     path_a, path_b = Path(a), Path(b)
-    given_a, given_b = map(_read_given_results, (path_a, path_b))
+    given_results_a, given_results_b = map(_read_given_results, (path_a, path_b))
     if path_a.samefile(path_b):
         raise ResultsError(f"{display_name(path_a)}: A and B are the same file. Give two files.")
     return list_changes(
-        given_a or _analyse_log(path_a, given_b, progress),
-        given_b or _analyse_log(path_b, given_a, progress),
+        given_results_a or _analyse_log(path_a, given_results_b, progress),
+        given_results_b or _analyse_log(path_b, given_results_a, progress),
     )
 
 
@@ -174,7 +174,7 @@ def _analyse_log(
 # ------------------------------------------------------------------ differences
 
 
-def list_changes(input_a: InputResults, input_b: InputResults) -> ChangeResults:
+def list_changes(input_a: InputResults, input_b: InputResults) -> DiffResults:
     """List the settings, numbers and findings that differ between the results of A and B."""
     results_a, results_b = input_a.results, input_b.results
     findings = (
@@ -182,7 +182,7 @@ def list_changes(input_a: InputResults, input_b: InputResults) -> ChangeResults:
         *_find_unshared_findings(results_a, results_b, "A"),
     )
     return make_results(
-        ChangeResults,
+        DiffResults,
         shlex.join(["px4fuse", "diff", input_a.file_name, input_b.file_name]),
         a=_describe_input(input_a),
         b=_describe_input(input_b),
@@ -226,7 +226,7 @@ def collect_compared_numbers(results: Results) -> dict[str, ComparedNumber]:
     """Return the numbers that ``px4fuse diff`` compares, by path (``clock.offset_s``)."""
     axes = {} if isinstance(results, AidsResults) else results.axes
     # EKF2 rejects north and east together, so their rejected fractions are equal: keep only one
-    horizontal_axes = [name for name in ("north", "east", AISLE) if name in axes]
+    horizontal_axes = [name for name in ("north", "east", AISLE_AXIS) if name in axes]
     omitted_paths = [f"axes.{name}.rejected_fraction" for name in horizontal_axes[1:]]
     # the axes already contain the numbers of the aiding source that measured the positions; EKF2
     # fuses all positions except those of GNSS as external vision
@@ -288,8 +288,8 @@ def compare_numbers(
             and math.isclose(
                 number_a.value,
                 number_b.value,
-                rel_tol=MAX_OMITTED_RELATIVE_DIFFERENCE,
-                abs_tol=MAX_OMITTED_DIFFERENCE,
+                rel_tol=MIN_RELATIVE_DIFFERENCE_OF_LISTED_NUMBERS,
+                abs_tol=MIN_DIFFERENCE_OF_LISTED_NUMBERS,
             )
         ):
             continue
@@ -326,17 +326,17 @@ def _describe_worse_verdicts(
     "error" that only B contains.
     """
     nis_and_nees_a, nis_and_nees_b = map(_collect_nis_and_nees, (results_a, results_b))
-    for label, (mean_a, was_consistent) in nis_and_nees_a.items():
-        mean_b, is_consistent = nis_and_nees_b.get(label, (mean_a, True))
+    for label, (mean_nis_or_nees_a, was_consistent) in nis_and_nees_a.items():
+        mean_nis_or_nees_b, is_consistent = nis_and_nees_b.get(label, (mean_nis_or_nees_a, True))
         if was_consistent and not is_consistent:
-            ratio = mean_b**0.5
+            ratio = mean_nis_or_nees_b**0.5
             factor_text = format_factor(max(ratio, 1.0 / ratio))
             verdict_text = f"overconfident, σ {factor_text} times too small"
             if ratio < 1.0:
                 verdict_text = f"underconfident, σ {factor_text} times too large"
             yield (
-                f"{label}: {format_number(mean_a)} (consistent) → {format_number(mean_b)} "
-                f"({verdict_text})."
+                f"{label}: {format_number(mean_nis_or_nees_a)} (consistent) → "
+                f"{format_number(mean_nis_or_nees_b)} ({verdict_text})."
             )
     error_ids = [
         finding.id for finding in findings if (finding.only_in, finding.severity) == ("B", "error")

@@ -13,7 +13,7 @@ from functools import partial
 from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
-from px4fuse.core.text import one_line
+from px4fuse.core.text import shorten_to_line
 from px4fuse.core.workers import Job, JobFailure, Result
 from px4fuse.errors import Px4FuseError, SettingsError
 
@@ -27,7 +27,7 @@ MAX_LOGS_PER_DASK_TASK = 4
 
 
 @contextmanager
-def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
+def connect_to_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
     """Connect to a Dask cluster; ``scheduler`` is the address of its scheduler.
 
     Yield None without an address: jobs then run on this computer.
@@ -53,7 +53,8 @@ def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
         client = Client(scheduler, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise SettingsError(
-            f"--scheduler {scheduler}: no Dask scheduler answers ({one_line(str(error), 120)}).",
+            f"--scheduler {scheduler}: no Dask scheduler answers "
+            f"({shorten_to_line(str(error), 120)}).",
             "Start a Dask scheduler with: dask scheduler",
         ) from error
     # without this, Dask prints tracebacks when the scheduler ends
@@ -106,7 +107,7 @@ def run_jobs(
                 raise Px4FuseError("the connection to the Dask scheduler was lost.")
             # jobs catch their own errors, so an exception means that the worker process failed
             error = future.exception()
-            failure = JobFailure(one_line(f"{type(error).__name__}: {error}", 300))
+            failure = JobFailure(shorten_to_line(f"{type(error).__name__}: {error}", 300))
             results = [failure] * len(jobs_of_task) if error else future.result()
             yield from zip(jobs_of_task, results, strict=True)
     finally:

@@ -10,9 +10,9 @@ from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from px4fuse.core.input_files import add_input
+from px4fuse.core.input_files import register_input_path
 from px4fuse.core.reading import max_log_bytes
-from px4fuse.core.text import one_line
+from px4fuse.core.text import shorten_to_line
 from px4fuse.errors import LogError, SettingsError
 
 if TYPE_CHECKING:
@@ -52,14 +52,14 @@ def find_logs(patterns: Iterable[str]) -> list[LogAddress]:
         A pattern matches no log, or a URL requires a package that is not installed.
     """
     logs_by_address = {
-        log.address: log for pattern in patterns for log in _find_pattern_logs(pattern)
+        log.address: log for pattern in patterns for log in _find_logs_matching_pattern(pattern)
     }
     if not logs_by_address:
         raise SettingsError("no logs were given. Give files, folders, globs or URLs.")
     return sorted(logs_by_address.values())
 
 
-def _find_pattern_logs(pattern: str) -> list[LogAddress]:
+def _find_logs_matching_pattern(pattern: str) -> list[LogAddress]:
     if not pattern:
         raise SettingsError("the name of a log is empty", "Give files, folders, globs or URLs.")
     file_system, root_path = _open_file_system(pattern)
@@ -81,7 +81,8 @@ def _find_pattern_logs(pattern: str) -> list[LogAddress]:
     # fsspec raises exceptions of many types, for example for an unknown account
     except Exception as error:
         raise SettingsError(
-            f"{pattern}: cannot be read ({one_line(str(error), 200) or type(error).__name__})."
+            f"{pattern}: cannot be read "
+            f"({shorten_to_line(str(error), 200) or type(error).__name__})."
         ) from error
     if not size_by_path:
         raise SettingsError(
@@ -95,7 +96,7 @@ def _find_pattern_logs(pattern: str) -> list[LogAddress]:
         path_for_table = os.path.relpath(path) if is_relative_path else address
         found_logs.append(LogAddress(_file_name(path), path_for_table, address, size_bytes))
         if is_local:
-            add_input(Path(path))
+            register_input_path(Path(path))
     return found_logs
 
 

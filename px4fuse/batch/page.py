@@ -22,7 +22,7 @@ from px4fuse.core.text import (
     format_number,
     format_ratio,
     join_first_names,
-    one_line,
+    shorten_to_line,
 )
 from px4fuse.findings.model import finding_title
 from px4fuse.html import frame
@@ -213,7 +213,7 @@ def _make_drop_down_lists(logs: Sequence[LogSummary]) -> list[tuple[str, list[tu
     drop_down_lists = []
     for label, counts in counts_by_label.items():
         options = [
-            (f"{label}:{value}", f"{one_line(value, 60)} ({count})")
+            (f"{label}:{value}", f"{shorten_to_line(value, 60)} ({count})")
             for value, count in counts.most_common()
         ]
         if options:

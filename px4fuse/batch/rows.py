@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from px4fuse.card.model import Card
+from px4fuse.card.model import DiagnosisCard
 from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.record import Unavailable, read_csv
 from px4fuse.core.text import format_utc_time, neutralise_formulas, replace_unencodable
@@ -100,7 +100,7 @@ def collect_finding_values(findings: Iterable[Finding], aids: Mapping[str, AidRe
     }
 
 
-def collect_card_values(card: Card) -> Row:
+def collect_card_values(card: DiagnosisCard) -> Row:
     """Return the diagnosis of a flight as columns of the table of ``px4fuse batch``.
 
     Columns: headline, recommended action, position RMSE, ratios of actual to reported σ, ...
@@ -121,7 +121,7 @@ def collect_card_values(card: Card) -> Row:
     }
 
 
-def find_first_action(card: Card) -> str:
+def find_first_action(card: DiagnosisCard) -> str:
     """Return the commands, or else the text, of the first recommended action."""
     if not card.causes:
         return ""

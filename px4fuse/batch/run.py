@@ -15,7 +15,7 @@ import msgspec
 import pandas as pd
 
 from px4fuse.batch import LOG_ANALYSIS_TIMEOUT_S
-from px4fuse.batch.engine import connect_cluster, run_jobs
+from px4fuse.batch.engine import connect_to_cluster, run_jobs
 from px4fuse.batch.job import Job, LogOutcome, analyse, make_failure_row, make_file_stem
 from px4fuse.batch.logs import LogAddress, find_logs
 from px4fuse.batch.page import format_html
@@ -40,7 +40,7 @@ from px4fuse.request import ComparisonRequest, command_line
 OUTPUT_FILE_COLUMNS = ("results", "report")
 RESUME_NOTE = "The results so far are kept. Run the same command to continue."
 
-BatchProgress = Callable[[str, int, int], None]
+BatchProgressCallback = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class CachedRows(msgspec.Struct, frozen=True):
 
 
 @dataclass(eq=False)
-class _RunState:
+class _BatchState:
     """Settings of ``px4fuse batch``, and finished logs."""
 
     output: Path
@@ -151,7 +151,7 @@ def run(
     scheduler: str | None = None,
     workers: int | None = None,
     memory_gb: float = MAX_MEMORY_BYTES / 1e9,
-    progress: BatchProgress = lambda *_: None,
+    progress: BatchProgressCallback = lambda *_: None,
     **settings: Any,
 ) -> BatchResult:
     """Compare KF and EKF2 on many logs, and write a table and the results to a folder.
@@ -181,7 +181,7 @@ def run(
     if request.position is not None:
         raise SettingsError("A position file belongs to one flight. Omit `position` for many logs.")
     requested_settings(request)  # raises SettingsError if a setting is out of range
-    state = _RunState(output, metadata.version("px4fuse"), command_line(request))
+    state = _BatchState(output, metadata.version("px4fuse"), command_line(request))
     # a worker process computes the SHA-256 of a log, and compares it only with finished logs of the
     # same size: a set of all finished logs would be large
     hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
@@ -198,7 +198,7 @@ def run(
         run_with_limits, analyse, timeout_s=timeout_s, max_memory_bytes=int(memory_gb * 1e9)
     )
     with (
-        connect_cluster(scheduler) as client,
+        connect_to_cluster(scheduler) as client,
         closing(run_jobs(client, run_in_processes, jobs, workers)) as finished_jobs,
     ):
         progress("comparing logs", 0, len(jobs))
@@ -217,7 +217,7 @@ def run(
     return batch_result
 
 
-def load_cached_rows(state: _RunState, reports: bool) -> Iterator[CachedRows]:
+def load_cached_rows(state: _BatchState, reports: bool) -> Iterator[CachedRows]:
     """Yield the cached table rows of logs that an earlier run finished with the same settings.
 
     With ``reports``, a log without a PDF report is not finished.
@@ -238,7 +238,7 @@ def load_cached_rows(state: _RunState, reports: bool) -> Iterator[CachedRows]:
             yield cached_rows
 
 
-def _cache_outcome(state: _RunState, log: LogAddress, outcome: LogOutcome | JobFailure) -> None:
+def _cache_outcome(state: _BatchState, log: LogAddress, outcome: LogOutcome | JobFailure) -> None:
     """Register a finished log in ``state``, and write its results."""
     if isinstance(outcome, JobFailure):
         remedy = "Increase --timeout or --memory, or run px4fuse compare on this log."
@@ -254,7 +254,7 @@ def _cache_outcome(state: _RunState, log: LogAddress, outcome: LogOutcome | JobF
     state.hash_by_log_address[log.address] = outcome.sha256
 
 
-def _write_log(state: _RunState, log: LogAddress, outcome: LogOutcome) -> CachedRows:
+def _write_log(state: _BatchState, log: LogAddress, outcome: LogOutcome) -> CachedRows:
     path_stem = f"results/{make_file_stem(log.name, outcome.sha256)}"
     content_by_name = {
         f"{path_stem}.json": outcome.results_json,
@@ -273,7 +273,7 @@ def _write_log(state: _RunState, log: LogAddress, outcome: LogOutcome) -> Cached
     return cached_rows
 
 
-def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
+def _write_table(state: _BatchState, logs: Iterable[LogAddress]) -> BatchResult:
     """Write the table of the finished logs as CSV, Parquet and web page."""
     all_rows: list[Row] = []
     first_log_by_hash: dict[str, LogAddress] = {}

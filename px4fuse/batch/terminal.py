@@ -1,15 +1,18 @@
 """Terminal output of ``px4fuse batch`` and ``px4fuse diff``."""
 
-from px4fuse.batch.changes import MAX_OMITTED_DIFFERENCE, MAX_OMITTED_RELATIVE_DIFFERENCE
+from px4fuse.batch.changes import (
+    MIN_DIFFERENCE_OF_LISTED_NUMBERS,
+    MIN_RELATIVE_DIFFERENCE_OF_LISTED_NUMBERS,
+)
 from px4fuse.batch.page import SIGMA_RATIO_LABELS, LogSummary, sort_logs, summarise_logs
 from px4fuse.batch.rows import STATUS_FAILED
 from px4fuse.batch.run import BatchResult
-from px4fuse.core.text import capitalise_first, format_count, format_number, format_ratio
-from px4fuse.filter.signals import AISLE
+from px4fuse.core.text import capitalise_first_letter, format_count, format_number, format_ratio
+from px4fuse.filter.signals import AISLE_AXIS
 from px4fuse.report.card_text import SEVERITY_SIGNS
 from px4fuse.report.page import Cell, Page, styled_text
 from px4fuse.report.style import MUTED_COLOUR, SEVERITY_COLOURS
-from px4fuse.results.contract import ChangeResults, ConfidenceInterval
+from px4fuse.results.contract import ConfidenceInterval, DiffResults
 
 MAX_LISTED_REASONS = 8
 MAX_LISTED_LOGS = 40
@@ -65,24 +68,24 @@ def _make_log_row(log: LogSummary) -> tuple[Cell, ...]:
     )
 
 
-def format_differences(results: ChangeResults) -> Page:
+def format_differences(results: DiffResults) -> Page:
     """Format the differences between two inputs A and B, for ``px4fuse diff``."""
     page = Page()
     for name, diff_input in (("A", results.a), ("B", results.b)):
         log_text = f" of {diff_input.log}" * (diff_input.given != diff_input.log)
         version_text = f"SHA-256 {diff_input.log_sha256[:12]}, px4fuse {diff_input.px4fuse}"
-        page.write_labelled(
+        page.write_labelled_text(
             name, f"{diff_input.given} ({diff_input.kind}{log_text}), {version_text}"
         )
     for text in results.worse:
-        page.write_labelled("Worse", styled_text(text, ERROR_COLOUR))
+        page.write_labelled_text("Worse", styled_text(text, ERROR_COLOUR))
     if not results.worse:
         page.write("Each error and each inconsistent filter of B is also in A.")
     for finding in results.findings:
         styled_message = styled_text(
             f"{finding.severity}: {finding.message}", SEVERITY_COLOURS[finding.severity]
         )
-        page.write_labelled(f"Only {finding.only_in}", styled_message)
+        page.write_labelled_text(f"Only {finding.only_in}", styled_message)
     for setting in results.settings:
         a_text, b_text = map(_format_setting, (setting.a, setting.b))
         page.write(f"Setting {setting.name}, A → B: {a_text} → {b_text}")
@@ -90,14 +93,17 @@ def format_differences(results: ChangeResults) -> Page:
     main_numbers = [
         number
         for number in results.numbers
-        if not number.path.startswith("axes.") or f".{AISLE}." in number.path
+        if not number.path.startswith("axes.") or f".{AISLE_AXIS}." in number.path
     ]
     for number in main_numbers or results.numbers:
         a_text = _format_value(number.a, number.a_interval, number.unit)
         b_text = _format_value(number.b, number.b_interval, number.unit)
-        label = capitalise_first(number.label.replace(AISLE, "axis of largest motion"))
+        label = capitalise_first_letter(number.label.replace(AISLE_AXIS, "axis of largest motion"))
         page.write(f"{label}, A → B: {a_text} → {b_text}")
-    tolerance_text = f"{100.0 * MAX_OMITTED_RELATIVE_DIFFERENCE:g} % or {MAX_OMITTED_DIFFERENCE:g}"
+    tolerance_text = (
+        f"{100.0 * MIN_RELATIVE_DIFFERENCE_OF_LISTED_NUMBERS:g} % or "
+        f"{MIN_DIFFERENCE_OF_LISTED_NUMBERS:g}"
+    )
     page.write_muted_text(
         f"Differences below {tolerance_text} are not listed. --json FILE lists the other axes too."
     )

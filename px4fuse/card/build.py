@@ -23,9 +23,9 @@ from px4fuse.card.model import (
     Action,
     AidConsistency,
     AnalysisDescription,
-    Card,
     CardSeverity,
     DiagnosedCause,
+    DiagnosisCard,
     FlightErrors,
     Note,
     Verdict,
@@ -41,9 +41,9 @@ from px4fuse.comparison.model import (
 )
 from px4fuse.comparison.remedy import find_aid
 from px4fuse.comparison.rerun_effects import classify_improvement
-from px4fuse.core.reading import display_name, file_size, read_head
+from px4fuse.core.reading import display_name, get_file_size, read_head
 from px4fuse.core.text import (
-    capitalise_first,
+    capitalise_first_letter,
     format_metres,
     format_ratio,
     lowercase_first_letter,
@@ -53,11 +53,11 @@ from px4fuse.ekf2.fusion_conditions import is_height_only
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
-from px4fuse.filter.signals import AISLE
+from px4fuse.filter.signals import AISLE_AXIS
 from px4fuse.finding import Finding
 from px4fuse.findings.model import format_count, format_percent, split_cause_groups
 from px4fuse.findings.source_positions import has_little_motion
-from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
 from px4fuse.flight.model import Ekf2, LogInfo, Unavailable
 from px4fuse.request import (
     COMPARISON_OPTIONS,
@@ -109,7 +109,7 @@ SOURCE_FAULT_EXPLANATIONS = (
 
 def build_card(
     analysis: Analysis, request: ComparisonRequest, student: tuple[str, str] = ("", "")
-) -> Card:
+) -> DiagnosisCard:
     """Build the diagnosis card of a flight.
 
     Parameters
@@ -133,7 +133,7 @@ def build_card(
     )
     if analysis.flight.log.is_assessed:
         headline = "Assignment: the student makes the diagnosis, so px4fuse prints none"
-        return Card(severity="note", headline=headline, identity=analysis_description)
+        return DiagnosisCard(severity="note", headline=headline, identity=analysis_description)
     cause_findings = [group[0] for group in split_cause_groups(analysis.findings)]
     verdicts = make_sigma_verdicts(analysis.main)
     ranked_causes = rank_causes(analysis, cause_findings)
@@ -150,7 +150,7 @@ def build_card(
     elif any(verdict.is_fault for verdict in sigma_verdicts):
         severity = "note"
     notes = _make_notes(cause_findings, request.log)
-    return Card(
+    return DiagnosisCard(
         severity=severity,
         id=causes[0].id if causes else "",
         headline=_make_headline(causes, sigma_verdicts),
@@ -169,14 +169,14 @@ def build_card(
 
 def build_aids_card(
     analysis: AidingSourceAnalysis, request: ComparisonRequest, student: tuple[str, str]
-) -> Card:
+) -> DiagnosisCard:
     """Build the diagnosis card of a flight without positions, about the aiding sources of EKF2."""
     cause_findings = [group[0] for group in split_cause_groups(analysis.findings)]
     faults = [finding for finding in cause_findings if finding.severity != "note"]
     causes = tuple(make_cause_without_reruns(finding) for finding in faults[:MAX_CAUSES_ON_CARD])
     missing_data = analysis.missing_data
     notes = _make_notes(cause_findings, request.log)
-    return Card(
+    return DiagnosisCard(
         severity=causes[0].severity if causes else "clean",
         id=causes[0].id if causes else "",
         headline=causes[0].title if causes else "No fault found in EKF2's aiding sources",
@@ -203,18 +203,18 @@ def build_aids_card(
     )
 
 
-def build_unusable_log_card(error: LogError | MissingDataError, path: Path) -> Card:
+def build_unusable_log_card(error: LogError | MissingDataError, path: Path) -> DiagnosisCard:
     """Build the diagnosis card of a log that cannot be analysed, with reason and action."""
     text_by_label = {}
     with suppress(LogError):  # the headline already contains the reason of an unreadable file
         first_bytes = read_head(path, PRINTED_FIRST_BYTES, LogError).hex(" ").upper()
-        size_bytes = file_size(path, LogError)
+        size_bytes = get_file_size(path, LogError)
         text_by_label["read"] = (
             f"{size_bytes:,} bytes; first bytes {first_bytes} (of a ULog: {ULOG_FIRST_BYTES})"
         )
     if error.remedy:
         text_by_label["fix"] = replace_argument_names(with_log_name(error.remedy, str(path)))
-    return Card(
+    return DiagnosisCard(
         severity="refused",
         id=error.id,
         headline=replace_argument_names(error.reason),
@@ -270,7 +270,7 @@ def _summarise_errors(analysis: Analysis) -> FlightErrors:
 def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
     """Describe a direction, for example "along the axis of largest motion, 30° from north"."""
     direction, heading, source = f"along {result.axis.label}", result.heading_deg, analysis.source
-    if result.axis.name != AISLE or heading is None:
+    if result.axis.name != AISLE_AXIS or heading is None:
         return direction
     reference = f"the {source.kind_name} x axis" if source.frame == "FRD" else "north"
     return f"{direction}, {heading % 180.0:.0f}° from {reference}"
@@ -346,7 +346,7 @@ def _describe_position_errors(
 def _describe_worst_axis(analysis: Analysis) -> list[str]:
     """State EKF2's error along another axis if it is overconfident there, more than along main."""
 
-    def compute_ratio(result: AxisComparison) -> float:
+    def compute_error_to_sigma_ratio(result: AxisComparison) -> float:
         # 0 for an axis that cannot be the worst: its error is unknown, or only EKF2's output lag
         truth = result.filters["ekf2"].truth
         if isinstance(truth, Unavailable) or (
@@ -355,8 +355,10 @@ def _describe_worst_axis(analysis: Analysis) -> list[str]:
             return 0.0
         return math.sqrt(truth.nees_position_mean or 0.0)
 
-    worst_result = max((analysis.main, *analysis.select_secondary_axes()), key=compute_ratio)
-    ratio = compute_ratio(worst_result)
+    worst_result = max(
+        (analysis.main, *analysis.select_secondary_axes()), key=compute_error_to_sigma_ratio
+    )
+    ratio = compute_error_to_sigma_ratio(worst_result)
     if worst_result is analysis.main or classify_sigma_ratio(ratio, "truth") != "overconfident":
         return []
     rmse_m = _find_rmse_by_filter_m(worst_result)["ekf2"]
@@ -395,7 +397,9 @@ def _format_actions(causes: Sequence[DiagnosedCause], notes: Sequence[Note]) -> 
             if action.commands or action.changes_something()
         ]
         label = f"Cause {number}, " if len(causes) > 1 else ""
-        numbered_sentences += [capitalise_first(f"{label}{sentence}.") for sentence in sentences]
+        numbered_sentences += [
+            capitalise_first_letter(f"{label}{sentence}.") for sentence in sentences
+        ]
     return tuple(dict.fromkeys(numbered_sentences))[:MAX_ACTIONS]
 
 
@@ -431,12 +435,12 @@ def _mark_explained_verdicts(
         if action.keeps_settings
         for label in action.target.split(", ")  # the target may be "KF, EKF2"
     }
-    word_against_truth = {
+    truth_verdict_word_by_filter = {
         verdict.filter: verdict.word for verdict in sigma_verdicts if verdict.against == "truth"
     }
 
     def needs_no_change(verdict: Verdict) -> bool:
-        true_word = word_against_truth[verdict.filter]
+        true_word = truth_verdict_word_by_filter[verdict.filter]
         if FILTER_NAMES[verdict.filter] in filters_to_keep_unchanged or true_word == "consistent":
             return True
         # Innovations do not contain drift, so small innovations do not prove a too large σ
@@ -458,8 +462,8 @@ def _explain_verdict_differences(
     """
     may_drift, ekf2_errors = analysis.source.origin.may_drift, analysis.main.filters["ekf2"].truth
     sigma_verdicts = _mark_explained_verdicts(sigma_verdicts, causes, may_drift=may_drift)
-    horizon_nees = getattr(ekf2_errors, "nees_position_horizon_mean", None)
-    horizon_sigma_ratio = math.sqrt(horizon_nees or math.inf)
+    mean_position_nees_at_horizon = getattr(ekf2_errors, "nees_position_horizon_mean", None)
+    horizon_sigma_ratio = math.sqrt(mean_position_nees_at_horizon or math.inf)
     # make_sigma_verdicts returns the verdict on EKF2 against ground truth last
     *other_verdicts, ekf2_verdict = sigma_verdicts
     if (
@@ -610,9 +614,9 @@ def _format_changed_parameters(analysis: Analysis) -> tuple[str, ...]:
         return ()
     log = analysis.flight.log
     return tuple(
-        f"{name} {value:.4g} {PARAMETERS[name].unit}".rstrip() + f" (PX4 default {default:g})"
+        f"{name} {value:.4g} {MODEL_PARAMETERS[name].unit}".rstrip() + f" (PX4 default {default:g})"
         for name in (aid.noise, aid.delay, aid.gate)
-        if name in PARAMETERS
+        if name in MODEL_PARAMETERS
         and (value := log.parameters.get(name)) is not None
         and not math.isclose(value, default := log.find_default_value(name), rel_tol=1e-3)
     )

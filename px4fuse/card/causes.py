@@ -8,7 +8,7 @@ from msgspec import structs
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import Action, ActionTarget, CardRerun, DiagnosedCause, Verdict
-from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z
+from px4fuse.comparison.changes import SIGMA_A_KEY, SIGMA_Z_KEY
 from px4fuse.comparison.model import FilterName
 from px4fuse.comparison.remedy import make_delay_change, select_changed_settings
 from px4fuse.comparison.rerun_effects import (
@@ -29,7 +29,7 @@ from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_text import format_sender_action
 from px4fuse.findings.model import FINDING_CATALOGUE, WRONG_CONVENTION_KEY
-from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
 from px4fuse.flight.model import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 
@@ -248,7 +248,7 @@ def _make_setting_actions(
     for rerun in reruns:
         (kind,), change = rerun.kinds, dict(rerun.change)
         if rerun.filter == "ekf2":
-            change = {name: value for name, value in change.items() if name in PARAMETERS}
+            change = {name: value for name, value in change.items() if name in MODEL_PARAMETERS}
             if change and kind != "delay":
                 yield make_parameter_action(analysis, change)
         elif kind != "defaults" and change.keys() <= COMPARISON_OPTIONS.keys():
@@ -357,7 +357,7 @@ def make_parameter_action(analysis: Analysis, change: Mapping[str, float]) -> Ac
     change = select_changed_settings(change, logged_parameters)
     for name, value in change.items():
         change_text = f"{name} {logged_parameters.get(name, math.nan):g} → {value:g}"
-        change_texts.append(f"{change_text} {PARAMETERS[name].printed_unit}".rstrip())
+        change_texts.append(f"{change_text} {MODEL_PARAMETERS[name].printed_unit}".rstrip())
         commands.append(f"param set {name} {value:g}")
     commands += ["reboot"] * any(name.endswith(REBOOT_PARAMETER_SUFFIXES) for name in change)
     return Action("EKF2", ", ".join(change_texts), tuple(commands), "console")
@@ -400,7 +400,7 @@ def _format_rerun_label(rerun: Rerun) -> str:
     change_texts = [
         f"{prefix}{COMPARISON_OPTIONS.get(name, name)} {value:g}"
         for name, value in rerun.change.items()
-        if name in {*PARAMETERS, SIGMA_A, SIGMA_Z}
+        if name in {*MODEL_PARAMETERS, SIGMA_A_KEY, SIGMA_Z_KEY}
     ]
     return ", ".join([label, *change_texts])
 

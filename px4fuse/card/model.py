@@ -8,7 +8,7 @@ from msgspec import Meta
 
 from px4fuse.comparison.model import FilterName
 from px4fuse.comparison.rerun_effects import Improvement
-from px4fuse.core.record import Count, NotNegative, PositiveFloat, Record, Share, Span
+from px4fuse.core.record import Count, NonNegativeFloat, PositiveFloat, Record, Share, Span
 from px4fuse.filter.consistency import Reference
 
 CardSeverity = Literal["clean", "note", "warning", "error", "refused"]
@@ -58,7 +58,7 @@ class Verdict(Record, kw_only=True):
     filter: FilterName
     against: Reference
     ratio: PositiveFloat | None = None
-    interval: tuple[NotNegative, NotNegative] | None = None
+    interval: tuple[NonNegativeFloat, NonNegativeFloat] | None = None
     word: VerdictWord
     samples: Count = 0
     reason: str = ""
@@ -89,9 +89,9 @@ class FlightErrors(Record, kw_only=True):
     """
 
     axis: str
-    position_rmse_m: Mapping[FilterName, NotNegative] = {}
-    horizontal_rmse_m: Mapping[FilterName, NotNegative] = {}
-    difference_rms_m: NotNegative | None = None
+    position_rmse_m: Mapping[FilterName, NonNegativeFloat] = {}
+    horizontal_rmse_m: Mapping[FilterName, NonNegativeFloat] = {}
+    difference_rms_m: NonNegativeFloat | None = None
     rejected_fraction: Share | None = None
     horizontal_resets: Count | None = None
 
@@ -144,9 +144,9 @@ class CardRerun(Record, kw_only=True):
     label: str
     is_prediction: bool = False
     from_s: float | None = None
-    position_rmse_m: tuple[NotNegative, NotNegative] | None = None
-    source_ratio: tuple[NotNegative, NotNegative] | None = None
-    truth_ratio: tuple[NotNegative, NotNegative] | None = None
+    position_rmse_m: tuple[NonNegativeFloat, NonNegativeFloat] | None = None
+    source_ratio: tuple[NonNegativeFloat, NonNegativeFloat] | None = None
+    truth_ratio: tuple[NonNegativeFloat, NonNegativeFloat] | None = None
     rejected_fraction: tuple[Share, Share] | None = None
     improves: Improvement
 
@@ -209,7 +209,7 @@ class AnalysisDescription(Record, kw_only=True):
     file: str
     firmware: str = ""
     hardware: str = ""
-    duration_s: NotNegative = 0.0
+    duration_s: NonNegativeFloat = 0.0
     source: str = ""
     settings: str = ""
     changed: tuple[str, ...] = ()
@@ -239,7 +239,7 @@ class AidConsistency(Record, kw_only=True):
     is_usual: bool = False
 
 
-class Card(Record, kw_only=True):
+class DiagnosisCard(Record, kw_only=True):
     """Diagnosis of a flight: headline, errors, recommended actions, filter consistency and causes.
 
     Attributes

@@ -14,7 +14,7 @@ from px4fuse.filter.consistency import Reference, classify_sigma_ratio, compute_
 from px4fuse.flight.model import Unavailable
 
 # Length (s) of the bootstrap blocks: longer than the usual correlation time of position errors
-BOOTSTRAP_BLOCK_S = 10.0
+BOOTSTRAP_BLOCK_DURATION_S = 10.0
 BOOTSTRAP_RESAMPLES = 2000
 # Minimum number of bootstrap blocks: with fewer the 95 % interval is far too narrow
 MIN_BOOTSTRAP_BLOCKS = 4
@@ -76,11 +76,15 @@ def block_bootstrap_rms(time_s: Array, values: Array) -> tuple[float, float] | N
 
     Block bootstrap: Künsch (1989), Annals of Statistics 17(3).
     """
-    block_count = int((time_s[-1] - time_s[0]) / BOOTSTRAP_BLOCK_S) if len(time_s) > 1 else 0
+    block_count = (
+        int((time_s[-1] - time_s[0]) / BOOTSTRAP_BLOCK_DURATION_S) if len(time_s) > 1 else 0
+    )
     if block_count < MIN_BOOTSTRAP_BLOCKS:
         return None
-    start_indices = np.arange(np.searchsorted(time_s, time_s[-1] - BOOTSTRAP_BLOCK_S, side="right"))
-    end_indices = np.searchsorted(time_s, time_s[start_indices] + BOOTSTRAP_BLOCK_S)
+    start_indices = np.arange(
+        np.searchsorted(time_s, time_s[-1] - BOOTSTRAP_BLOCK_DURATION_S, side="right")
+    )
+    end_indices = np.searchsorted(time_s, time_s[start_indices] + BOOTSTRAP_BLOCK_DURATION_S)
     cumulative_squares = np.concatenate(([0.0], np.cumsum(np.square(values))))
     block_square_sums = cumulative_squares[end_indices] - cumulative_squares[start_indices]
     drawn_block_indices = np.random.default_rng(0).integers(

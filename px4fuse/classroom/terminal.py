@@ -5,7 +5,7 @@ from pathlib import Path
 
 from px4fuse.classroom.assignment.key import AnswerKey
 from px4fuse.classroom.grading.grade import GradeOutcome
-from px4fuse.core.text import format_count, one_line
+from px4fuse.core.text import format_count, shorten_to_line
 from px4fuse.errors import to_one_line
 from px4fuse.report.page import Page
 from px4fuse.report.style import GOOD_COLOUR, SEVERITY_COLOURS
@@ -46,13 +46,13 @@ def grading_page(outcome: GradeOutcome) -> Page:
         status = report.status if report else "missing"
         if report and grade.total is None:
             status += ", pending"
-            name = one_line(grade.display_name, 60)
+            name = shorten_to_line(grade.display_name, 60)
             pending_texts.append(f"{name}: {report.pending_actions}")
         colour = GOOD_COLOUR if status == "verified" else SEVERITY_COLOURS["warning"]
         points_text = "–" if grade.total is None else f"{grade.total:g}"
         rows.append(
             (
-                one_line(grade.student or grade.student_id, 60),
+                shorten_to_line(grade.student or grade.student_id, 60),
                 grade.file_name,
                 (status, colour),
                 f"{points_text} / {grade.max_points:g}",

@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 
 from px4fuse.cli.options import log_argument, output_option
-from px4fuse.cli.outputs import write_new
+from px4fuse.cli.outputs import write_new_file
 
 
 @click.command()
@@ -23,4 +23,4 @@ def answers(log: Path, output: Path | None) -> None:
 
     form_path = output or log.with_name(form_name(log.name))
     sha256 = hashlib.sha256(read_log_bytes(log)).hexdigest()
-    write_new(form_path, format_answer_form(log.name, sha256).encode())
+    write_new_file(form_path, format_answer_form(log.name, sha256).encode())

@@ -89,7 +89,7 @@ def evaluate(
     LOG:ekf2, LOG:kf or LOG:truth. Prints errors with 95 % intervals. Writes a PDF report and the
     results as JSON.
     """
-    from px4fuse.loop.tracks import make_file_stem, read_source
+    from px4fuse.loop.tracks import make_file_stem, read_trajectory_source
     from px4fuse.report.evaluation import make_evaluation_page
     from px4fuse.results.build import make_evaluation_results
     from px4fuse.trajectory.evaluation import evaluate as evaluate_trajectory
@@ -106,8 +106,8 @@ def evaluate(
     outputs.choose_report_paths(output, json_path)
     with outputs.progress(json_path) as show_progress:
         show_progress("reading")
-        estimate_source = read_source(request.estimate, system=request.system)
-        reference_source = read_source(
+        estimate_source = read_trajectory_source(request.estimate, system=request.system)
+        reference_source = read_trajectory_source(
             request.reference, default_track="truth", system=request.system
         )
         show_progress("computing errors")

@@ -15,7 +15,7 @@ from px4fuse.cli.options import (
     output_option,
 )
 from px4fuse.cli.outputs import write_outputs
-from px4fuse.core.input_files import check_output_folder, suspend_input_registration
+from px4fuse.core.input_files import check_output_folder, protect_inputs
 from px4fuse.core.reading import read_text
 from px4fuse.errors import OutputError, to_one_line
 
@@ -74,7 +74,7 @@ def extract(
 
 def _require_same_flight(folder: Path, sha256: str) -> None:
     try:
-        with suspend_input_registration():
+        with protect_inputs(is_active=False):
             text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
         earlier_log = json.loads(text)["log"]
         earlier_name, earlier_sha256 = earlier_log["name"], earlier_log["sha256"]

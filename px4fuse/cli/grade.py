@@ -17,8 +17,8 @@ from px4fuse.cli.options import (
     open_option,
     output_option,
 )
-from px4fuse.cli.outputs import folder_progress, write_and_print_results, write_new
-from px4fuse.core.input_files import add_input, check_output_folder
+from px4fuse.cli.outputs import folder_progress, write_and_print_results, write_new_file
+from px4fuse.core.input_files import check_output_folder, register_input_path
 from px4fuse.core.reading import list_files_recursively
 from px4fuse.errors import OutputError, SettingsError
 
@@ -131,14 +131,14 @@ def grade(
     reports. Submitted files are never executed, and are read with limits of time and memory.
     """
     from px4fuse.classroom.assignment.key import read_answer_key
-    from px4fuse.classroom.assignment.roster import read_people, read_sheet
+    from px4fuse.classroom.assignment.roster import read_csv_sheet, read_people
     from px4fuse.classroom.grading.entries import Course, parse_due_time, parse_late_rule
     from px4fuse.classroom.grading.grade import grade as grade_submissions
-    from px4fuse.classroom.grading.rubric import read_rubric, rubric_text
+    from px4fuse.classroom.grading.rubric import read_default_rubric_text, read_rubric
     from px4fuse.classroom.terminal import grading_page
 
     if write_rubric is not None:
-        write_new(write_rubric, rubric_text().encode())
+        write_new_file(write_rubric, read_default_rubric_text().encode())
         return
     if late_rule_text and due_time_text is None:
         raise SettingsError("--late requires --due TIME.")
@@ -155,12 +155,12 @@ def grade(
         None if key is None else read_answer_key(key),
         logs,
         option_values.pop("title") or "",
-        roster=None if roster is None else read_people(read_sheet(roster)),
-        worksheets=tuple(map(read_sheet, option_values.pop("worksheet"))),
+        roster=None if roster is None else read_people(read_csv_sheet(roster)),
+        worksheets=tuple(map(read_csv_sheet, option_values.pop("worksheet"))),
         grade_column_title=option_values.pop("column") or "",
         due=parse_due_time(due_time_text) if due_time_text else None,
         late_rule=parse_late_rule(late_rule_text) if late_rule_text else None,
-        grace_s=60.0 * option_values.pop("grace"),
+        grace_period_s=60.0 * option_values.pop("grace"),
         question_count=question_count,
         **option_values,
     )
@@ -187,5 +187,5 @@ def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None
                 "Choose another output folder."
             )
         for file in list_files_recursively(path):
-            add_input(file)
+            register_input_path(file)
     check_output_folder(output)

@@ -199,14 +199,14 @@ def _format_output_files(
 
     contents = {}
     if tum_path is not None:
-        best_path = loop_result.choose_best_path()
-        if best_path is loop_result.odometry:
+        best_flight_path = loop_result.choose_best_path()
+        if best_flight_path is loop_result.odometry:
             raise MissingDataError(
                 f"--tum {display_name(tum_path)}: the path is not corrected: no loop closure was "
                 "accepted. Give a loop closure (--closure) or the landing place (--landed-at)."
             )
         contents[tum_path] = format_tum(
-            from_z_down(best_path.trajectory, loop_result.original_frame)
+            from_z_down(best_flight_path.trajectory, loop_result.original_frame)
         ).encode()
     if g2o_path is not None:
         contents[g2o_path] = format_g2o(loop_result.solved_graph()).encode()

@@ -152,12 +152,12 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
     """
     from mcp.types import Tool
 
-    from px4fuse.card.model import Card
+    from px4fuse.card.model import DiagnosisCard
     from px4fuse.results import contract
 
     command_and_type_by_tool: dict[str, tuple[str, type | UnionType | None]] = {
         "info": ("info", dict),
-        "diagnose": ("compare", Card),
+        "diagnose": ("compare", DiagnosisCard),
         "what_if": ("whatif", contract.WhatIfResults),
         "estimate_noise": ("tune", contract.TuningResults),
         "estimate_time_offset": ("sync", contract.SyncResults),

@@ -20,7 +20,7 @@ from msgspec import Struct, structs
 
 from px4fuse.batch import LOG_ANALYSIS_TIMEOUT_S
 from px4fuse.cli.outputs import OPENS_OUTPUT_KEY
-from px4fuse.core.input_files import add_input
+from px4fuse.core.input_files import register_input_path
 from px4fuse.core.reading import (
     max_log_bytes,
     read_log_bytes,
@@ -73,7 +73,7 @@ class InputPath(NonEmptyPath):
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         path = super().convert(value, param, ctx)
-        add_input(split_path_and_part(str(path))[0])
+        register_input_path(split_path_and_part(str(path))[0])
         return path
 
 
@@ -109,7 +109,7 @@ class NumberWithUnit(click.ParamType["float | str"]):
         return number
 
 
-def _set_max_size(ctx: click.Context, _: click.Parameter, megabytes: int | None) -> None:
+def _set_max_log_size(ctx: click.Context, _: click.Parameter, megabytes: int | None) -> None:
     if megabytes is not None:
         token = max_log_bytes.set(megabytes * 1_000_000)
         ctx.call_on_close(lambda: max_log_bytes.reset(token))
@@ -140,7 +140,7 @@ max_size_option = click.option(
     type=click.IntRange(1),
     metavar="MB",
     expose_value=False,
-    callback=_set_max_size,
+    callback=_set_max_log_size,
     help=f"Maximum size of a log (MB).  [default: {max_log_bytes.get() // 1_000_000}]",
 )
 
@@ -257,7 +257,7 @@ def request_option(
 
 _comparison_option = partial(request_option, ComparisonRequest)
 _position_option = partial(request_option, PositionFile)
-_clock_option = _comparison_option(
+_clock_offset_option = _comparison_option(
     "clock_offset_s",
     "Time (s) to add to the timestamps of the position source; auto estimates it.  [default: 0; "
     "auto with --position]",
@@ -346,11 +346,15 @@ filter_options = _combine_options(
     ),
 )
 #: Options for the input files and the clock offset of one flight
-flight_options = _combine_options(system_option, position_options, _clock_option, max_size_option)
+flight_options = _combine_options(
+    system_option, position_options, _clock_offset_option, max_size_option
+)
 #: Options of commands that run KF on one flight
 analysis_options = _combine_options(filter_options, flight_options)
 #: Options of commands that run KF on many logs: ``analysis_options`` without a position file
-settings_options = _combine_options(filter_options, system_option, _clock_option, max_size_option)
+settings_options = _combine_options(
+    filter_options, system_option, _clock_offset_option, max_size_option
+)
 
 
 def comparison_request(log: Path, option_values: dict[str, Any]) -> ComparisonRequest:

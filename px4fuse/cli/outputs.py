@@ -96,13 +96,15 @@ def progress(*output_paths: Path | None) -> Iterator[ShowProgress]:
     with rich_progress.Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("starting", total=None, count="")
 
-        def show(activity: str, done_count: int = 0, total_count: int | None = None) -> None:
+        def show_progress(
+            activity: str, done_count: int = 0, total_count: int | None = None
+        ) -> None:
             count = "" if total_count is None else f"{done_count} of {total_count}"
             bar.update(
                 task, description=activity, completed=done_count, total=total_count, count=count
             )
 
-        yield show
+        yield show_progress
 
 
 @contextmanager
@@ -281,7 +283,7 @@ def describe_written_files(context: click.Context) -> str:
     return f"{format_written_outputs(written_files)}." if written_files else "nothing was written."
 
 
-def write_new(path: Path, content: bytes) -> None:
+def write_new_file(path: Path, content: bytes) -> None:
     """Write a new file and print its name; an existing file is not overwritten.
 
     Raises

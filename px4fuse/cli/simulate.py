@@ -227,7 +227,7 @@ def _check_options(assignment: Path | None, kind: str) -> None:
 def _write_assignment(
     roster: Path,
     folder: Path,
-    answer_path: Path | None,
+    requested_answer_key_path: Path | None,
     secret_file: Path | None,
     scenario_kind: Any,
     fault_count: int | None,
@@ -250,7 +250,7 @@ def _write_assignment(
         )
         secret = derive_seed_from_secret(secret_text, option_text)
     students = read_roster(roster)
-    answer_key_path = assignment.answer_key_path(folder, answer_path)
+    answer_key_path = assignment.answer_key_path(folder, requested_answer_key_path)
     check_output_paths([answer_key_path])
     check_output_folder(folder)
     with progress() as show_progress:

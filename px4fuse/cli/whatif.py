@@ -14,9 +14,11 @@ _SWEEP_PATTERN = re.compile("([^=]*)=([^:]*):([^:]*)(?::([0-9]+))?")
 
 
 def _parse_number(parameter_name: str, text: str) -> Any:
-    from px4fuse.flight.ekf2_parameters import PARAMETERS
+    from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
 
-    unit = PARAMETERS[parameter_name].printed_unit if parameter_name in PARAMETERS else ""
+    unit = (
+        MODEL_PARAMETERS[parameter_name].printed_unit if parameter_name in MODEL_PARAMETERS else ""
+    )
     try:
         return options.NumberWithUnit(unit).convert(text, None, None)
     except click.BadParameter as error:

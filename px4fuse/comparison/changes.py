@@ -22,30 +22,30 @@ from px4fuse.comparison.rerun_effects import (
     RIGHT_BIAS_KEY,
     ROTATION_KEY,
     TIME_OFFSET_KEY,
-    Change,
+    ChangedValues,
     Statistic,
 )
 from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.flight.ekf2_parameters import GNSS_VEL, PARAMETERS
+from px4fuse.flight.ekf2_parameters import GNSS_VEL, MODEL_PARAMETERS
 from px4fuse.flight.model import LogInfo, Unavailable
 
 # Minimum SIGMA_Z (m) in a re-run of KF: the position noise of motion capture
 MIN_RERUN_SIGMA_Z_M = 0.005
-SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
+SIGMA_A_KEY, SIGMA_Z_KEY = "sigma_a_m_s2", "sigma_z_m"
 # Kind of change for each KF setting and each correction of the data
 KIND_BY_CHANGE_NAME = {
-    SIGMA_A: "noises",
-    SIGMA_Z: "noises",
+    SIGMA_A_KEY: "noises",
+    SIGMA_Z_KEY: "noises",
     OUTLIERS_KEY: "outliers",
     TIME_OFFSET_KEY: "time offset",
     ROTATION_KEY: "rotation",
     FORWARD_BIAS_KEY: "bias",
     RIGHT_BIAS_KEY: "bias",
 }
-KF_NOISE_SETTINGS = frozenset((SIGMA_A, SIGMA_Z))
+KF_NOISE_SETTINGS = frozenset((SIGMA_A_KEY, SIGMA_Z_KEY))
 ACC_NOISE = "EKF2_ACC_NOISE"
 # EKF2 is re-run with a larger EKF2_ACC_NOISE only if the lower limit of the estimate is above this
 # multiple of the logged value: tilt errors and biases also increase the estimate
@@ -69,25 +69,32 @@ def find_candidate_changes(
     axis: str,
     summary: FilterSummary,
     statistic: Statistic,
-) -> list[Change]:
-    """Return the changes of settings or data that may correct the mean NIS or NEES of a filter."""
+) -> list[ChangedValues]:
+    """Return the changes of settings or data that may correct the mean NIS or NEES of a filter.
+
+    KF: noises, outliers, time offset, rotation and accelerometer bias. EKF2: noise, outliers,
+    delay, rotation and default parameters. Along the down axis: noise, outliers and delay only.
+    """
+    # A filter whose mean NIS is too small needs smaller noises, and outliers are not the cause
     is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
     axis_tuning = find_axis_tuning(estimates.tuning, axis)
-    changes = list[Change]()
+    changes = list[ChangedValues]()
     # Do not reduce the noise settings for GNSS or odometry: innovations do not show the slow errors
     # of these sources, only ground truth does
     origin = comparison.source.origin
     may_have_correlated_errors = (
         origin.may_drift or origin.is_gnss
     ) and not summary.is_underconfident_against_truth
-    if axis_tuning is not None and not (is_underconfident and may_have_correlated_errors):
-        changes += (
-            _find_kf_noise_changes(comparison.settings, axis_tuning, is_underconfident)
-            if ekf2_inputs is None
-            else _find_ekf2_noise_changes(ekf2_inputs, summary, axis_tuning)
-        )
-    if axis_tuning is not None and not is_underconfident and len(axis_tuning.outlier_time_s):
-        changes.append({OUTLIERS_KEY: float(len(axis_tuning.outlier_time_s))})
+    if axis_tuning is not None:
+        if not (is_underconfident and may_have_correlated_errors):
+            changes += (
+                _find_kf_noise_changes(comparison.settings, axis_tuning, is_underconfident)
+                if ekf2_inputs is None
+                else _find_ekf2_noise_changes(ekf2_inputs, summary, axis_tuning)
+            )
+        if not is_underconfident and len(axis_tuning.outlier_time_s):
+            changes.append({OUTLIERS_KEY: float(len(axis_tuning.outlier_time_s))})
+    # For EKF2, the delay parameter corrects the time offset, if PX4 permits the delay
     delay_change = ekf2_inputs and make_estimated_delay_change(
         comparison, ekf2_inputs, estimates.time_offset
     )
@@ -113,8 +120,12 @@ def find_main_axis_changes(
     ekf2_inputs: ReplayInputs | None,
     axis: str,
     summary: FilterSummary,
-) -> list[Change]:
-    """Return the changes of settings or data for re-runs along the axis of largest motion."""
+) -> list[ChangedValues]:
+    """Return the changes of settings or data for re-runs along the axis of largest motion.
+
+    The report shows their effect also if the filter is consistent.
+    """
+    # Changes for the mean NIS are first
     changes = remove_repeated_changes(
         change
         for statistic in CONSISTENCY_STATISTICS[::-1]
@@ -123,9 +134,11 @@ def find_main_axis_changes(
         )
     )
     if ekf2_inputs is not None:
+        # Correct timestamps have another effect than the delay parameter, which has limits
         if any(ekf2_inputs.aid.delay in change for change in changes):
             changes += _find_offset_changes(estimates, ekf2_inputs)
         return remove_repeated_changes(changes)
+    # For KF, also test both noises together, and the default settings
     noise_changes = [change for change in changes if change.keys() <= KF_NOISE_SETTINGS]
     if len(noise_changes) > 1:
         changes.append({name: value for change in noise_changes for name, value in change.items()})
@@ -135,13 +148,13 @@ def find_main_axis_changes(
     return changes
 
 
-def remove_repeated_changes(changes: Iterable[Change]) -> list[Change]:
+def remove_repeated_changes(changes: Iterable[ChangedValues]) -> list[ChangedValues]:
     """Return equal changes only once, at the place of the first."""
     return list({frozenset(change.items()): change for change in changes}.values())
 
 
 def classify_change(
-    comparison: Comparison, ekf2_inputs: ReplayInputs | None, change: Change
+    comparison: Comparison, ekf2_inputs: ReplayInputs | None, change: ChangedValues
 ) -> tuple[str, ...]:
     """Return the kind of each changed value, for example ("noise",) or ("delay", "outliers")."""
     if ekf2_inputs is None and change == find_default_settings(comparison):
@@ -154,10 +167,12 @@ def classify_change(
     return tuple(dict.fromkeys(kinds.get(name, "process noise") for name in changed_names))
 
 
-def find_default_settings(comparison: Comparison) -> Change:
+def find_default_settings(comparison: Comparison) -> ChangedValues:
     """Return the change that sets SIGMA_A and SIGMA_Z to their default values."""
     user_settings, default_settings = comparison.settings, Settings()
-    setting_names = (SIGMA_A,) if comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
+    setting_names = (
+        (SIGMA_A_KEY,) if comparison.source.origin.is_gnss else (SIGMA_A_KEY, SIGMA_Z_KEY)
+    )
     return {
         name: getattr(default_settings, name)
         for name in setting_names
@@ -170,7 +185,9 @@ def find_axis_tuning(tuning: TuningByAxis, axis: str) -> AxisTuning | None:
     return find_first_available_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
 
-def _find_offset_changes(estimates: Estimates, ekf2_inputs: ReplayInputs | None) -> list[Change]:
+def _find_offset_changes(
+    estimates: Estimates, ekf2_inputs: ReplayInputs | None
+) -> list[ChangedValues]:
     """Return the change that corrects the time offset, if the time offset is significant."""
     time_offset = estimates.time_offset
     if (
@@ -190,25 +207,30 @@ def _find_offset_changes(estimates: Estimates, ekf2_inputs: ReplayInputs | None)
 
 def _find_kf_noise_changes(
     settings: Settings, axis_tuning: AxisTuning, is_underconfident: bool
-) -> list[Change]:
+) -> list[ChangedValues]:
     """Return changes of SIGMA_A and SIGMA_Z to their estimates, if they differ significantly."""
-    changes = list[Change]()
-    for name, noise in ((SIGMA_A, axis_tuning.sigma_a_two_state), (SIGMA_Z, axis_tuning.sigma_z)):
+    changes = list[ChangedValues]()
+    for name, noise in (
+        (SIGMA_A_KEY, axis_tuning.sigma_a_two_state),
+        (SIGMA_Z_KEY, axis_tuning.sigma_z),
+    ):
         setting = getattr(settings, name)
+        # A setting is too large above the 95 % interval, and too small below it. Without an
+        # estimate, a setting that is too large is reduced to the upper limit of the interval
         if is_underconfident:
             estimate = noise.value_or_bound(0.0)
             is_significant = noise.high is not None and setting > noise.high
         else:
             estimate = noise.value or 0.0
             is_significant = noise.low is not None and setting < noise.low
-        if noise.value is None and name == SIGMA_Z:
+        if noise.value is None and name == SIGMA_Z_KEY:
             estimate = max(estimate, MIN_RERUN_SIGMA_Z_M)
         if estimate and is_significant:
             changes.append({name: float(f"{estimate:.3g}")})
     return changes
 
 
-def _find_bias_changes(estimates: Estimates) -> list[Change]:
+def _find_bias_changes(estimates: Estimates) -> list[ChangedValues]:
     systematic_errors = estimates.systematic_errors
     if isinstance(systematic_errors, Unavailable) or not systematic_errors.has_significant_bias():
         return []
@@ -221,7 +243,7 @@ def _find_bias_changes(estimates: Estimates) -> list[Change]:
 
 def _find_ekf2_noise_changes(
     ekf2_inputs: ReplayInputs, summary: FilterSummary, axis_tuning: AxisTuning
-) -> list[Change]:
+) -> list[ChangedValues]:
     """Return the change of EKF2's position noise to its estimate, if it differs significantly."""
     noise_m = axis_tuning.sigma_z.value
     if noise_m is None:  # no estimate: use the RMS innovation, an upper bound of the noise
@@ -230,9 +252,13 @@ def _find_ekf2_noise_changes(
     return [change] if change else []
 
 
-def _find_default_changes(log: LogInfo, ekf2_inputs: ReplayInputs) -> list[Change]:
+def _find_default_changes(log: LogInfo, ekf2_inputs: ReplayInputs) -> list[ChangedValues]:
     """Return one change to PX4's default for each EKF2 noise that differs from the default."""
-    gate, logged_parameters, changes = ekf2_inputs.aid.gate, ekf2_inputs.settings, list[Change]()
+    gate, logged_parameters, changes = (
+        ekf2_inputs.aid.gate,
+        ekf2_inputs.settings,
+        list[ChangedValues](),
+    )
     for name in (gate, *PARAMETERS_SET_TO_DEFAULT):
         default, value = log.find_default_value(name), logged_parameters.get(name, np.nan)
         # A missing parameter is NaN. Comparisons with NaN are False, so it is not changed
@@ -243,12 +269,14 @@ def _find_default_changes(log: LogInfo, ekf2_inputs: ReplayInputs) -> list[Chang
 
 def _find_acc_noise_changes(
     settings: Settings, ekf2_inputs: ReplayInputs, axis_tuning: AxisTuning
-) -> list[Change]:
+) -> list[ChangedValues]:
     """Return the change of EKF2_ACC_NOISE to its estimate, if the estimate is much larger."""
     logged_acc_noise, sigma_a = ekf2_inputs.settings[ACC_NOISE], axis_tuning.sigma_a_two_state
     acc_noise_per_sigma_a = (settings.dt_s / ekf2_inputs.mean_step_s) ** 0.5
     min_acc_noise = (sigma_a.low or 0.0) * acc_noise_per_sigma_a
-    acc_noise = min((sigma_a.value or 0.0) * acc_noise_per_sigma_a, PARAMETERS[ACC_NOISE].maximum)
+    acc_noise = min(
+        (sigma_a.value or 0.0) * acc_noise_per_sigma_a, MODEL_PARAMETERS[ACC_NOISE].maximum
+    )
     if (
         min_acc_noise <= MIN_ESTIMATED_TO_LOGGED_ACC_NOISE_RATIO * logged_acc_noise
         or acc_noise <= logged_acc_noise

@@ -13,8 +13,8 @@ from px4fuse.comparison.model import (
     FILTER_NAMES,
     AxisComparison,
     Comparison,
-    Difference,
     ErrorsAgainstTruth,
+    FilterDifference,
     FilterName,
     FilterSummary,
     FilterTracks,
@@ -26,13 +26,13 @@ from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import HorizontalNis, assess_horizontal_nis
 from px4fuse.filter.kalman import KfRun, predict_track, run_kf
 from px4fuse.filter.model import STATE_COLUMNS
-from px4fuse.filter.signals import AISLE, Axis, Segment
+from px4fuse.filter.signals import AISLE_AXIS, Axis, Segment
 from px4fuse.flight.model import (
     RECORD_NOT_LOGGED,
     Ekf2,
     TableOrUnavailable,
     Unavailable,
-    sample_rate,
+    compute_sample_rate_hz,
 )
 
 INNOVATION_COLUMNS = ["innovation_m", "innovation_variance_m2"]
@@ -51,9 +51,11 @@ def compare(prepared_comparison: PreparedComparison) -> Comparison:
             # (aids, record) still contain the resets, so they are not used
             ekf2 = replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
     axis_names = [axis.name for axis in prepared_comparison.input_axes]
-    main_name = AISLE if AISLE in axis_names else axis_names[0]
+    main_axis_name = AISLE_AXIS if AISLE_AXIS in axis_names else axis_names[0]
     axes = {
-        axis.name: _compare_axis(prepared_comparison, ekf2, axis, is_main=axis.name == main_name)
+        axis.name: _compare_axis(
+            prepared_comparison, ekf2, axis, is_main=axis.name == main_axis_name
+        )
         for axis in prepared_comparison.input_axes
     }
     north_and_east = [axes[name] for name in ("north", "east") if name in axes]
@@ -73,8 +75,16 @@ def _compare_axis(
     segment = prepared_comparison.segment
     # Only the axis of largest motion, which the report shows step by step, needs filterpy
     kf_run = run_kf(axis, prepared_comparison.settings, fast=not is_main)
-    ekf2_tracks, truth = tracks_and_truth = project_tracks(prepared_comparison, ekf2, axis, segment)
+    ekf2_tracks, truth = project_tracks(prepared_comparison, ekf2, axis, segment)
+    whole_flight_tracks = ekf2_tracks, truth
+    if segment.flight_span_s not in (None, (segment.start_s, segment.end_s)):
+        whole_flight_tracks = project_tracks(prepared_comparison, ekf2, axis, segment.whole_flight)
     tracks: dict[FilterName, FilterTracks] = {"kf": make_run_tracks(kf_run), "ekf2": ekf2_tracks}
+    filters = {}
+    for name, filter_tracks in tracks.items():
+        state, variance = find_compared_track(filter_tracks, ekf2_tracks.state)
+        errors = compute_error_statistics(state, variance, truth, filter_tracks.fusion_horizon)
+        filters[name] = _summarise_filter(filter_tracks, errors)
     updates = kf_run.updates
     north, east, down = axis.direction.tolist()
     rejected_flags = _drop_missing_values(ekf2_tracks.innovations, "rejected")
@@ -86,27 +96,17 @@ def _compare_axis(
             count=len(updates),
             first_s=float(updates.index[0]),
             last_s=float(updates.index[-1]),
-            rate_hz=sample_rate(updates) if len(updates) > 1 else None,
+            rate_hz=compute_sample_rate_hz(updates) if len(updates) > 1 else None,
             input_gap_s=kf_run.input_gap_s,
         ),
-        filters={
-            name: _summarise_filter(
-                each,
-                compute_error_statistics(
-                    *find_compared_track(each, ekf2_tracks.state), truth, each.fusion_horizon
-                ),
-            )
-            for name, each in tracks.items()
-        },
+        filters=filters,
         difference=compute_difference_statistics(kf_run, ekf2_tracks.state),
         rejected_fraction=float(rejected_flags.mean()) if len(rejected_flags) else None,
         axis=axis,
         kf_run=kf_run,
         tracks=tracks,
         truth=truth,
-        whole_flight_tracks=tracks_and_truth
-        if segment.flight_span_s in (None, (segment.start_s, segment.end_s))
-        else project_tracks(prepared_comparison, ekf2, axis, segment.whole_flight),
+        whole_flight_tracks=whole_flight_tracks,
     )
 
 
@@ -176,7 +176,7 @@ def _drop_missing_values(table: TableOrUnavailable, column: str) -> pd.Series:
 
 def compute_difference_statistics(
     kf_run: KfRun, ekf2_state: TableOrUnavailable
-) -> Difference | Unavailable:
+) -> FilterDifference | Unavailable:
     """Compute the difference KF - EKF2 along one axis at EKF2's sample times."""
     if isinstance(ekf2_state, Unavailable):
         return ekf2_state
@@ -189,7 +189,7 @@ def compute_difference_statistics(
             f"KF and EKF2 have only {len(position_m)} common samples",
             "Choose a time span in which EKF2 runs.",
         )
-    return Difference(
+    return FilterDifference(
         count=len(position_m),
         position_rms_m=_compute_rmse(position_m),
         position_mean_m=float(np.mean(position_m)),
@@ -240,7 +240,7 @@ def compute_error_statistics(
             "filter and ground truth do not overlap in time",
             "Choose a time span with ground truth.",
         )
-    nees_position, nees_velocity = (
+    mean_position_nees, mean_velocity_nees = (
         _compute_mean_nees(error / interpolate_sigma(state.index.to_numpy(), variance, column))
         for error, column in (
             (position_m, "position_variance_m2"),
@@ -257,8 +257,8 @@ def compute_error_statistics(
         count=count,
         position_rmse_m=_compute_rmse(position_m),
         velocity_rmse_m_s=_compute_rmse(velocity_m_s) if np.isfinite(velocity_m_s).any() else None,
-        nees_position_mean=nees_position,
-        nees_velocity_mean=nees_velocity,
+        nees_position_mean=mean_position_nees,
+        nees_velocity_mean=mean_velocity_nees,
         nees_position_horizon_mean=nees_at_horizon,
     )
 

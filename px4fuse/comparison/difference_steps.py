@@ -12,14 +12,14 @@ from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.remedy import find_used_noise_m
 from px4fuse.core.text import format_count
 from px4fuse.ekf2 import steps
-from px4fuse.ekf2.filter_recursion import FilterConfiguration
+from px4fuse.ekf2.filter_batch import FilterConfiguration
 from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import Ekf2Model
 from px4fuse.ekf2.replay import is_inside_spans
 from px4fuse.ekf2.steps import DifferenceExplanation, DifferenceOutsideReplay, PropertyReplacement
 from px4fuse.filter.kalman import KfRun, predict_track, run_kf
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import AISLE
+from px4fuse.filter.signals import AISLE_AXIS
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.model import Spans, Unavailable
@@ -33,12 +33,12 @@ MIN_CONTRIBUTION_FRACTION = 0.05
 # The user's SIGMA_A or SIGMA_Z is wrong if it differs from its estimate by this factor or more
 MIN_SETTING_TO_ESTIMATE_RATIO = 4.0
 # A property of EKF2 is not reported if its use in KF changes KF's position by less (m)
-MIN_POSITION_CHANGE_M = 1e-6
+MIN_REPORTED_KF_POSITION_CHANGE_M = 1e-6
 # A position difference KF - EKF2 outside the replayed time is reported only above this value (m)
 MIN_DIFFERENCE_OUTSIDE_REPLAY_M = 0.5
 # A position difference KF - EKF2 outside the replayed time is reported only if it is larger by this
 # factor than the difference inside the replayed time
-MIN_OUTSIDE_TO_INSIDE_REPLAY_RATIO = 3.0
+MIN_OUTSIDE_TO_INSIDE_DIFFERENCE_RATIO = 3.0
 
 
 def explain_ekf2_difference(
@@ -79,7 +79,7 @@ def explain_ekf2_difference(
             steps=tuple(
                 replacement
                 for replacement in by_steps.steps
-                if replacement.position_moved_m > MIN_POSITION_CHANGE_M
+                if replacement.position_moved_m > MIN_REPORTED_KF_POSITION_CHANGE_M
             ),
             outside=_find_difference_at_times_without_replay(
                 axis_results[name], kf_runs[name], by_steps.spans_s
@@ -93,7 +93,7 @@ def explain_ekf2_difference(
 
 def find_corrected_noise_settings(comparison: Comparison, tuning: TuningByAxis) -> dict[str, float]:
     """Return the estimates of those KF noises that are wrong by a large factor."""
-    axis_tuning = find_first_available_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
+    axis_tuning = find_first_available_tuning(tuning, HORIZONTAL, AISLE_AXIS, "north", "east")
     if axis_tuning is None or comparison.source.origin.is_gnss:
         return {}
     estimate_by_setting = {}
@@ -175,7 +175,7 @@ def add_cause_sentences(
         causes.append(("Second largest", second))
     for rank_text, replacement in causes:
         reason = reason_by_property_name[replacement.name]
-        if replacement.name == steps.REJECTION_PROPERTY:
+        if replacement.name == steps.REJECTION_REPLACEMENT_NAME:
             reason += _describe_rejections(explanation)
         sentences.append(
             f"{rank_text} contribution to the difference KF - EKF2 along {axis_label}: "
@@ -184,9 +184,10 @@ def add_cause_sentences(
         )
     sentences += [_describe_unexplained_fractions(explanation), *_describe_rmse(explanation)]
     outside = explanation.outside
-    inside_maximum_m = np.max(np.abs(explanation.kf_minus_ekf2_m))
+    max_difference_inside_replay_m = np.max(np.abs(explanation.kf_minus_ekf2_m))
     if outside is not None and outside.maximum_m > max(
-        MIN_DIFFERENCE_OUTSIDE_REPLAY_M, MIN_OUTSIDE_TO_INSIDE_REPLAY_RATIO * inside_maximum_m
+        MIN_DIFFERENCE_OUTSIDE_REPLAY_M,
+        MIN_OUTSIDE_TO_INSIDE_DIFFERENCE_RATIO * max_difference_inside_replay_m,
     ):
         sentences.append(
             "Outside the replayed times (while EKF2 initialises or does not fuse positions) the "
@@ -210,14 +211,14 @@ def _describe_replacement_effect(
 
 
 def _describe_rejections(explanation: DifferenceExplanation) -> str:
-    rejections = explanation.longest_rejection
-    if rejections is None:
+    longest_rejection = explanation.longest_rejection
+    if longest_rejection is None:
         return ""
     return (
-        f". From {rejections.start_s:.0f} s on, EKF2 rejected "
-        f"{format_count(rejections.samples, 'position')} in a row for "
-        f"{rejections.duration_s:.1f} s. Replays with and without gate differ by up to "
-        f"{rejections.distance_m:.2g} m in EKF2's position"
+        f". From {longest_rejection.start_s:.0f} s on, EKF2 rejected "
+        f"{format_count(longest_rejection.samples, 'position')} in a row for "
+        f"{longest_rejection.duration_s:.1f} s. Replays with and without gate differ by up to "
+        f"{longest_rejection.distance_m:.2g} m in EKF2's position"
     )
 
 
@@ -254,32 +255,38 @@ def _describe_property_differences(
         "IMU" if acc_noise_as_sigma_a < kf_settings.sigma_a_m_s2 else "positions"
     )
     return {
-        steps.SAMPLE_TIMES_PROPERTY: prediction_text,
-        steps.TIMESTAMPS_PROPERTY: delay_text,
-        steps.MEASUREMENT_NOISE_PROPERTY: (
+        steps.SAMPLE_TIMES_REPLACEMENT_NAME: prediction_text,
+        steps.TIMESTAMPS_REPLACEMENT_NAME: delay_text,
+        steps.MEASUREMENT_NOISE_REPLACEMENT_NAME: (
             f"EKF2 uses a measurement noise of {find_used_noise_m(inputs):.2g} m "
             f"({aid.noise}), KF uses {kf_settings.sigma_z_m:.2g} m"
         ),
-        steps.ACCELEROMETER_BIAS_PROPERTY: "EKF2 estimates the accelerometer bias; KF does not",
-        steps.PROCESS_NOISE_PROPERTY: (
+        steps.ACCELEROMETER_BIAS_REPLACEMENT_NAME: (
+            "EKF2 estimates the accelerometer bias; KF does not"
+        ),
+        steps.PROCESS_NOISE_REPLACEMENT_NAME: (
             f"EKF2_ACC_NOISE {acc_noise:g} has the same effect as SIGMA_A "
             f"{acc_noise_as_sigma_a:.2g} m/s²; KF has SIGMA_A {kf_settings.sigma_a_m_s2:.2g} m/s². "
             f"EKF2 gives the {higher_weighted_input} more weight than KF does"
         ),
-        steps.ATTITUDE_PROPERTY: (
+        steps.ATTITUDE_REPLACEMENT_NAME: (
             "EKF2 corrects its attitude with the positions; KF uses EKF2's logged attitude"
         ),
-        steps.MAGNETOMETER_PROPERTY: (
+        steps.MAGNETOMETER_REPLACEMENT_NAME: (
             "EKF2 estimates its heading with the magnetometer; KF uses EKF2's published heading"
         ),
-        steps.GNSS_VELOCITY_PROPERTY: "EKF2 also fuses GNSS velocity; KF uses GNSS position only",
-        steps.FLOW_PROPERTY: "EKF2 also fuses optical flow; KF uses positions only",
-        steps.VISION_PROPERTY: "EKF2 fuses external vision and GNSS; KF uses one position source",
-        steps.REJECTION_PROPERTY: (
+        steps.GNSS_VELOCITY_REPLACEMENT_NAME: (
+            "EKF2 also fuses GNSS velocity; KF uses GNSS position only"
+        ),
+        steps.FLOW_REPLACEMENT_NAME: "EKF2 also fuses optical flow; KF uses positions only",
+        steps.VISION_REPLACEMENT_NAME: (
+            "EKF2 fuses external vision and GNSS; KF uses one position source"
+        ),
+        steps.REJECTION_REPLACEMENT_NAME: (
             f"EKF2 rejects {100 * model.agreement.rejected_fraction_logged:.1f} % of the "
             f"positions of {ekf2_source}; KF has no innovation gate and uses all positions"
         ),
-        steps.OUTPUT_PREDICTOR_PROPERTY: (
+        steps.OUTPUT_PREDICTOR_REPLACEMENT_NAME: (
             f"EKF2 fuses positions with a delay of {1e3 * inputs.horizon_s:.0f} ms. EKF2's "
             f"output predictor (EKF2_TAU_POS {parameters['EKF2_TAU_POS']:g} s) extrapolates "
             "to the present. KF has no delay"
@@ -289,7 +296,7 @@ def _describe_property_differences(
 
 def _describe_unexplained_fractions(explanation: DifferenceExplanation) -> str:
     velocity_mean_square_m2_s2 = explanation.velocity_mean_square_m2_s2
-    position_text, velocity_text = (
+    unexplained_position_text, unexplained_velocity_text = (
         f"{100 * min(fraction, 1.0):.1f} %"
         for fraction in (
             explanation.unexplained_fraction,
@@ -299,9 +306,9 @@ def _describe_unexplained_fractions(explanation: DifferenceExplanation) -> str:
     return (
         "RMS difference KF - EKF2 over the replayed times: "
         f"{explanation.position_mean_square_m2**0.5:.3f} m and "
-        f"{velocity_mean_square_m2_s2**0.5:.3f} m/s. The replay does not explain {position_text} "
-        f"of the mean square position difference and {velocity_text} of the mean square velocity "
-        "difference."
+        f"{velocity_mean_square_m2_s2**0.5:.3f} m/s. The replay does not explain "
+        f"{unexplained_position_text} of the mean square position difference and "
+        f"{unexplained_velocity_text} of the mean square velocity difference."
     )
 
 
@@ -315,13 +322,13 @@ def _describe_rmse(explanation: DifferenceExplanation) -> list[str]:
             f"{100 * MAX_RELATIVE_RMSE_DIFFERENCE:.0f} %): KF {kf_rmse_m:.3f} m, EKF2 "
             f"{ekf2_rmse_m:.3f} m."
         ]
+    # The properties are replaced one after the other: each replacement starts at the RMSE of the
+    # previous one. Find the largest change of the mean square in the direction from KF to EKF2
     rmses_m = [
         kf_rmse_m,
         *(replacement.position_rmse_to_truth_m or 0.0 for replacement in explanation.steps),
     ]
-    mean_square_changes = np.diff(np.square(rmses_m))
-    if ekf2_rmse_m < kf_rmse_m:
-        mean_square_changes *= -1.0
+    mean_square_changes = np.diff(np.square(rmses_m)) * np.sign(ekf2_rmse_m - kf_rmse_m)
     index = int(np.argmax(mean_square_changes))
     return [
         f"Position RMSE: EKF2 {ekf2_rmse_m:.3f} m, KF {kf_rmse_m:.3f} m. KF's RMSE changes "

@@ -43,7 +43,7 @@ MIN_JITTER_S = 0.008
 # timestamp residual · velocity
 RESIDUAL_TO_JITTER_ERROR_RATIO_LIMITS = 0.6, 1.5
 # Minimum RMS of the position residuals due to jitter ÷ RMS of all position residuals
-MIN_JITTER_PART_OF_RESIDUAL = 0.4
+MIN_JITTER_FRACTION_OF_RESIDUAL = 0.4
 # Jitter, and noise that increases with speed, are reported only above this multiple of their σ
 MIN_SIGNIFICANCE_SIGMAS = 6.0
 # Number of flight parts in which the correlation of noise with speed is tested
@@ -58,7 +58,7 @@ MIN_RMS_DISTANCE_FROM_PATH_MEAN_M = 0.5
 # Length (s) of the running mean that removes drift from the errors of odometry
 DRIFT_WINDOW_S = 12.0
 # Duration (s) of the flight parts whose time offsets are estimated separately
-OFFSET_PART_DURATION_S = 4.0
+FLIGHT_PART_DURATION_FOR_OFFSET_S = 4.0
 # Minimum RMS speed (m/s) of a flight part to estimate its time offset
 MIN_SPEED_FOR_OFFSET_M_S = 0.3
 # Minimum reported variation (s) of the time offset: a position error of 8 cm at 1 m/s
@@ -95,7 +95,7 @@ ROTATION_COMPARISON_TIME_S = 0.1
 MAX_ROTATION_DIFFERENCE_RAD = 0.2
 # A delay of the logged attitude is reported only if its removal reduces the mean square rotation
 # difference between attitude and gyroscopes to less than this fraction
-MAX_REMAINING_ROTATION_DIFFERENCE_RATIO = 0.5
+MAX_ROTATION_DIFFERENCE_RATIO_WITHOUT_DELAY = 0.5
 # In fast flight, minimum speed (m/s) and noise (m) to report noise that increases with speed
 MIN_HIGH_SPEED_M_S, MIN_NOISE_AT_HIGH_SPEED_M = 0.3, 0.02
 # σ of normal noise ÷ median of its absolute values
@@ -147,7 +147,8 @@ class ErrorFit(NamedTuple):
     residual_m : ndarray, shape (n, 2)
         Remaining error against ground truth.
     columns : ndarray, shape (n, 2, 5)
-        Derivatives of the position error with respect to the five fitted parameters.
+        Derivatives of the position error with respect to the five fitted parameters: offset along
+        each axis, scale factor error, rotation, and time offset.
     """
 
     time_s: Array
@@ -179,7 +180,7 @@ class PeriodicError(NamedTuple):
     fraction: float
 
 
-class OffsetVariation(NamedTuple):
+class TimeOffsetVariation(NamedTuple):
     """Range of the time offset of the positions in flight.
 
     Attributes
@@ -196,7 +197,7 @@ class OffsetVariation(NamedTuple):
     most_at_s: float
 
 
-def _rotate_90(vectors: Array) -> Array:
+def _rotate_clockwise_90_deg(vectors: Array) -> Array:
     return vectors[:, ::-1] * [-1.0, 1.0]
 
 
@@ -221,13 +222,15 @@ def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
     rows, neighbour_rows, elapsed_s = (
         array[has_close_neighbours] for array in (rows, neighbour_rows, elapsed_s)
     )
-    # Weights of Lagrange interpolation
-    weights = np.ones_like(elapsed_s)
-    for neighbour in range(len(NEIGHBOUR_ROW_OFFSETS)):
-        for other_neighbour in set(range(len(NEIGHBOUR_ROW_OFFSETS))) - {neighbour}:
-            other_elapsed_s = elapsed_s[:, other_neighbour]
-            weights[:, neighbour] *= other_elapsed_s / (other_elapsed_s - elapsed_s[:, neighbour])
+    # Weights of Lagrange interpolation at elapsed time 0: Π t_j / (t_j - t_i) over all j ≠ i
+    numerators = np.repeat(elapsed_s[:, None], len(NEIGHBOUR_ROW_OFFSETS), axis=1)
+    denominators = numerators - elapsed_s[:, :, None]
+    is_same = np.eye(len(NEIGHBOUR_ROW_OFFSETS), dtype=bool)
+    numerators[:, is_same] = denominators[:, is_same] = 1.0
+    weights = np.prod(numerators / denominators, axis=2)
+    # σ of position - Σ weight · neighbour, for equal σ of all positions
     residual_to_position_sigma_ratio = np.sqrt(1.0 + np.sum(weights**2, axis=1))
+    # Timestamps minus equal intervals; the running median contains drift and gaps, but no jitter
     timestamp_deviation_s = time_s - interval_s * np.arange(len(time_s))
     padded_deviation_s = np.pad(
         timestamp_deviation_s, TIMESTAMP_MEDIAN_FILTER_LENGTH // 2, mode="edge"
@@ -246,19 +249,19 @@ def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
 
     def compute_residual(values: Array) -> Array:
         interpolated_values = np.einsum("nk,nk...->n...", weights, values[neighbour_rows])
-        scaled_residuals = (
-            (values[rows] - interpolated_values).T / residual_to_position_sigma_ratio
-        ).T
-        return np.asarray(scaled_residuals[has_small_interpolation_noise])
+        scaled_residuals = (values[rows] - interpolated_values).T / residual_to_position_sigma_ratio
+        return np.asarray(scaled_residuals.T[has_small_interpolation_noise])
 
     ekf2 = comparison.flight.ekf2
     ekf2_speed_m_s = None
     if isinstance(ekf2, Ekf2):
-        logged_speed_m_s = np.linalg.norm(ekf2.state[Columns.VELOCITY[:2]].to_numpy(), axis=1)
+        speed_at_ekf2_times_m_s = np.linalg.norm(
+            ekf2.state[Columns.VELOCITY[:2]].to_numpy(), axis=1
+        )
         ekf2_speed_m_s = np.interp(
             time_s[rows[has_small_interpolation_noise]],
             ekf2.state.index.to_numpy(),
-            logged_speed_m_s,
+            speed_at_ekf2_times_m_s,
         )
     return LocalResiduals(
         compute_residual(position_m),
@@ -275,18 +278,20 @@ def find_timestamp_jitter(errors: LocalResiduals) -> float | None:
     jitter_s = float(np.std(errors.timestamp_jitter_s))
     if jitter_s < MIN_JITTER_S or not expected_square_sum_m2:
         return None
+    # Linear regression, without a constant, of the residuals on those expected from the jitter
     residual_ratio = float(np.sum(errors.residual_m * expected_residual_m)) / expected_square_sum_m2
     unexplained_residual_m = errors.residual_m - residual_ratio * expected_residual_m
     residual_ratio_sigma = np.sqrt(
         RESIDUAL_CORRELATION_LENGTH * np.mean(unexplained_residual_m**2) / expected_square_sum_m2
     )
+    # The ratio must be near 1 and significant, and jitter must cause much of the position noise
     jitter_fraction = np.sqrt(expected_square_sum_m2 / np.sum(errors.residual_m**2))
     is_jitter = (
         RESIDUAL_TO_JITTER_ERROR_RATIO_LIMITS[0]
         < residual_ratio
         < RESIDUAL_TO_JITTER_ERROR_RATIO_LIMITS[1]
         and residual_ratio > MIN_SIGNIFICANCE_SIGMAS * residual_ratio_sigma
-        and jitter_fraction > MIN_JITTER_PART_OF_RESIDUAL
+        and jitter_fraction > MIN_JITTER_FRACTION_OF_RESIDUAL
     )
     return jitter_s if is_jitter else None
 
@@ -297,29 +302,28 @@ def find_speed_dependent_noise(errors: LocalResiduals) -> SpeedDependentNoise | 
     speed_m_s = errors.ekf2_speed_m_s
     if speed_m_s is None:
         return None
-    residual_norms_m = np.linalg.norm(errors.residual_m, axis=1)
+    norms_and_speeds = np.column_stack([np.linalg.norm(errors.residual_m, axis=1), speed_m_s])
     # Also test each flight part: noise that is larger in one fast part may be unrelated to speed
-    correlation_z_scores = [
-        rank_correlation(residual_norms_m[part], speed_m_s[part])
-        * np.sqrt(len(part) / RESIDUAL_CORRELATION_LENGTH)
-        for part in (
-            np.arange(len(residual_norms_m)),
-            *np.array_split(np.arange(len(residual_norms_m)), FLIGHT_PART_COUNT),
-        )
-        if np.ptp(residual_norms_m[part]) and np.ptp(speed_m_s[part])
-    ]
+    flight_parts = np.array_split(norms_and_speeds, FLIGHT_PART_COUNT)
+    if not np.all([np.ptp(part, axis=0) for part in flight_parts]):
+        return None
+    flight_z_score, *part_z_scores = (
+        rank_correlation(*part.T) * np.sqrt(len(part) / RESIDUAL_CORRELATION_LENGTH)
+        for part in (norms_and_speeds, *flight_parts)
+    )
     if (
-        len(correlation_z_scores) <= FLIGHT_PART_COUNT
-        or correlation_z_scores[0] < MIN_SIGNIFICANCE_SIGMAS
-        or np.median(correlation_z_scores[1:]) < MIN_NOISE_SPEED_CORRELATION_SIGMAS
+        flight_z_score < MIN_SIGNIFICANCE_SIGMAS
+        or np.median(part_z_scores) < MIN_NOISE_SPEED_CORRELATION_SIGMAS
     ):
         return None
-    speed_limits_m_s = np.quantile(speed_m_s, [SLOW_SPEED_QUANTILE, FAST_SPEED_QUANTILE])
-    is_slow, is_fast = speed_m_s <= speed_limits_m_s[0], speed_m_s >= speed_limits_m_s[1]
+    max_slow_m_s, min_fast_m_s = np.quantile(speed_m_s, [SLOW_SPEED_QUANTILE, FAST_SPEED_QUANTILE])
+    is_slow, is_fast = speed_m_s <= max_slow_m_s, speed_m_s >= min_fast_m_s
     source_speed_m_s = np.linalg.norm(errors.velocity_m_s, axis=1, keepdims=True)
     direction = errors.velocity_m_s / np.maximum(source_speed_m_s, 1e-6)
     along_track_residual_m = np.abs(np.sum(errors.residual_m * direction, axis=1))
-    cross_track_residual_m = np.abs(np.sum(errors.residual_m * _rotate_90(direction), axis=1))
+    cross_track_residual_m = np.abs(
+        np.sum(errors.residual_m * _rotate_clockwise_90_deg(direction), axis=1)
+    )
     # If the noise increases only along the track, jitter may be the cause: report only noise that
     # increases along and across the track
     if any(
@@ -327,13 +331,11 @@ def find_speed_dependent_noise(errors: LocalResiduals) -> SpeedDependentNoise | 
         for noise_m in (along_track_residual_m, cross_track_residual_m)
     ):
         return None
-    noise_at_low_and_high_speed_m = (
-        SIGMA_PER_MEDIAN_ABSOLUTE_VALUE * float(np.median(np.abs(errors.residual_m[rows])))
-        for rows in (is_slow, is_fast)
-    )
-    low_and_high_speed_m_s = (float(np.median(speed_m_s[rows])) for rows in (is_slow, is_fast))
     speed_dependent_noise = SpeedDependentNoise(
-        *noise_at_low_and_high_speed_m, *low_and_high_speed_m_s
+        slow_m=_estimate_sigma(errors.residual_m[is_slow]),
+        fast_m=_estimate_sigma(errors.residual_m[is_fast]),
+        slow_m_s=float(np.median(speed_m_s[is_slow])),
+        fast_m_s=float(np.median(speed_m_s[is_fast])),
     )
     is_relevant = (
         speed_dependent_noise.fast_m_s >= MIN_HIGH_SPEED_M_S
@@ -342,7 +344,9 @@ def find_speed_dependent_noise(errors: LocalResiduals) -> SpeedDependentNoise | 
     return speed_dependent_noise if is_relevant else None
 
 
-def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> ErrorFit | None:
+def fit_errors_against_truth(
+    comparison: Comparison, local_residuals: LocalResiduals
+) -> ErrorFit | None:
     """Fit constant offset, scale, rotation and time offset to the errors against ground truth."""
     truth = comparison.flight.truth
     if isinstance(truth, Unavailable):
@@ -354,21 +358,16 @@ def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> Error
     if len(time_s) < MIN_POSITIONS:
         return None
     true_spline = CubicSpline(true_positions_m.index, true_positions_m)
-    path_m, velocity_m_s = true_spline(time_s), true_spline(time_s, 1)
-    path_m = path_m - path_m.mean(axis=0)
+    true_m, velocity_m_s = true_spline(time_s), true_spline(time_s, 1)
+    path_m = true_m - true_m.mean(axis=0)
     path_mean_square_m2 = float(np.mean(np.sum(path_m**2, axis=1)))
     if path_mean_square_m2 < MIN_RMS_DISTANCE_FROM_PATH_MEAN_M**2:
         return None
+    offset_columns = [np.tile(axis, (len(time_s), 1)) for axis in np.eye(2)]
     columns = np.stack(
-        [
-            *np.broadcast_to(np.eye(2)[:, None], (2, len(time_s), 2)),
-            path_m,
-            _rotate_90(path_m),
-            -velocity_m_s,
-        ],
-        axis=-1,
+        [*offset_columns, path_m, _rotate_clockwise_90_deg(path_m), -velocity_m_s], axis=-1
     )
-    error_m = position_m - true_spline(time_s)
+    error_m = position_m - true_m
     parameters, residual_m = _fit_least_squares(columns, error_m)
     # The σ of the scale factor depends on the number of independent errors, not of all errors
     interval_s = compute_median_interval_s(time_s)
@@ -378,6 +377,8 @@ def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> Error
     scale_error_sigma = np.sqrt(
         np.mean(residual_m**2) / (path_mean_square_m2 * independent_error_count)
     )
+    # The slow errors of odometry are its residuals without drift. The running mean of the constant
+    # offsets is zero, so their columns are omitted
     if comparison.source.origin.may_drift:
         from scipy.ndimage import uniform_filter1d  # noqa: PLC0415 - slow import
 
@@ -389,19 +390,22 @@ def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> Error
         _, residual_m = _fit_least_squares(
             remove_running_mean(columns)[..., 2:], remove_running_mean(error_m)
         )
-    white_noise_sigma_m = SIGMA_PER_MEDIAN_ABSOLUTE_VALUE * float(
-        np.median(np.abs(local_residuals.residual_m))
-    )
+    _, _, scale, _, _ = parameters.tolist()
     return ErrorFit(
         time_s,
         velocity_m_s,
         path_m,
         columns,
         residual_m,
-        white_noise_sigma_m,
-        float(parameters[2]),
+        _estimate_sigma(local_residuals.residual_m),
+        scale,
         float(scale_error_sigma),
     )
+
+
+def _estimate_sigma(residuals: Array) -> float:
+    """Return σ, estimated from the median so that outliers have little effect."""
+    return SIGMA_PER_MEDIAN_ABSOLUTE_VALUE * float(np.median(np.abs(residuals)))
 
 
 def _fit_least_squares(columns: Array, values: Array) -> tuple[Array, Array]:
@@ -416,6 +420,7 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
     duration_s = fit.time_s[-1] - fit.time_s[0]
     max_frequency_hz = min(MAX_FREQUENCY_HZ, 0.25 / compute_median_interval_s(fit.time_s))
     frequency_step_hz = FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT / duration_s
+    # Frequency k of the spectrum is k · frequency_step_hz
     rows = slice(
         round(MIN_PERIOD_COUNT / FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT),
         int(np.ceil(max_frequency_hz / frequency_step_hz)),
@@ -452,11 +457,11 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
     return PeriodicError(1.0 / frequency_hz, amplitude_m, explained_fraction)
 
 
-def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
+def find_time_offset_variation(fit: ErrorFit) -> TimeOffsetVariation | None:
     """Return the range of the time offset in flight if its variation explains the slow errors."""
-    flight_part_indices = np.floor((fit.time_s - fit.time_s[0]) / OFFSET_PART_DURATION_S).astype(
-        int
-    )
+    flight_part_indices = np.floor(
+        (fit.time_s - fit.time_s[0]) / FLIGHT_PART_DURATION_FOR_OFFSET_S
+    ).astype(int)
     square_speed_sums = np.bincount(flight_part_indices, np.sum(fit.velocity_m_s**2, axis=1))
     mean_square_speeds = square_speed_sums / np.maximum(np.bincount(flight_part_indices), 1)
     moving_part_indices = np.flatnonzero(mean_square_speeds > MIN_SPEED_FOR_OFFSET_M_S**2)
@@ -478,13 +483,14 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
         )
         return velocity_weighted_sums * inverse_square_speed_sums[:, None]
 
-    # Last column: the errors to be fitted by the other columns
+    # Columns of the constant parameters. Last column: the errors to be fitted by the other columns
     columns = np.concatenate([fit.columns[..., :-1], fit.residual_m[..., None]], axis=-1)
     time_offsets_by_column_s = fit_time_offsets_by_part(columns)
     columns -= (
         error_per_time_offset_m_s[:, :, None] * time_offsets_by_column_s[flight_part_indices, None]
     )
     parameters, residual_m = _fit_least_squares(columns[..., :-1], columns[..., -1])
+    # Time offsets of the errors that the constant parameters do not explain
     offsets_s = (time_offsets_by_column_s @ np.append(-parameters, 1.0))[moving_part_indices]
     slow_error_mean_square_m2 = fit.compute_slow_error_mean_square_m2()
     unexplained_mean_square_m2 = (
@@ -498,9 +504,11 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
         > MAX_REMAINING_SLOW_ERROR_FRACTION * slow_error_mean_square_m2
     ):
         return None
-    times_s = fit.time_s[0] + OFFSET_PART_DURATION_S * (moving_part_indices + 0.5)
+    times_s = fit.time_s[0] + FLIGHT_PART_DURATION_FOR_OFFSET_S * (moving_part_indices + 0.5)
     extreme_indices = [int(np.argmin(offsets_s)), int(np.argmax(offsets_s))]
-    return OffsetVariation(*offsets_s[extreme_indices].tolist(), *times_s[extreme_indices].tolist())
+    return TimeOffsetVariation(
+        *offsets_s[extreme_indices].tolist(), *times_s[extreme_indices].tolist()
+    )
 
 
 def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | None:
@@ -525,7 +533,9 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
     )
     angle_rad = integrate_cumulatively(imu[Columns.ANGULAR_RATE].to_numpy(), imu_time_s)
 
-    # The tested delays are multiples of the sampling interval
+    # The tested delays are multiples of the sampling interval. The gyro rotations begin one maximum
+    # delay earlier than those of the attitude: row i of the attitude, without delay, is row
+    # i + max_delay_in_rows of the gyros
     max_delay_in_rows = round(MAX_ATTITUDE_DELAY_S / ROTATION_INTERVAL_S)
     gyro_time_s = time_s[0] + ROTATION_INTERVAL_S * np.arange(
         -max_delay_in_rows, len(time_s) + max_delay_in_rows
@@ -546,6 +556,7 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
         )
         return float(np.mean(limited_angles_rad**2))
 
+    # Test every sixth delay, then every second delay near the best of them
     tested_delays_in_rows = range(-max_delay_in_rows, max_delay_in_rows + 1, 2)
     coarse_index = 3 * int(np.argmin([*map(compute_mean_square_rad2, tested_delays_in_rows[::3])]))
     nearby_delays_in_rows = tested_delays_in_rows[max(coarse_index - 2, 0) : coarse_index + 3]
@@ -553,5 +564,5 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
     delay_s = ROTATION_INTERVAL_S * delay_in_rows
     is_delay_significant = abs(delay_s) >= MIN_ATTITUDE_DELAY_S and compute_mean_square_rad2(
         delay_in_rows
-    ) < MAX_REMAINING_ROTATION_DIFFERENCE_RATIO * compute_mean_square_rad2(0)
+    ) < MAX_ROTATION_DIFFERENCE_RATIO_WITHOUT_DELAY * compute_mean_square_rad2(0)
     return delay_s if is_delay_significant else None

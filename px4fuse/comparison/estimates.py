@@ -13,7 +13,7 @@ from scipy.special import stdtr
 from px4fuse.comparison.imu_oscillation import ImuOscillation, find_imu_oscillation
 from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.comparison.noise_differences import (
-    NoisyPart,
+    NoisyFlightPart,
     find_noisy_flight_part,
     tune_perpendicular_axes,
 )
@@ -32,7 +32,7 @@ from px4fuse.filter.hypotheses import (
     fit_systematic_errors,
 )
 from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S, MotionCache
-from px4fuse.filter.signals import AISLE, Axis
+from px4fuse.filter.signals import AISLE_AXIS, Axis
 from px4fuse.filter.time_offset import (
     MAX_OFFSET_INTERVAL_HALF_WIDTH_S,
     MIN_TIME_OFFSET_CHANGE_S,
@@ -92,7 +92,7 @@ class Estimates:
     source_low_pass: SourceLowPass | Unavailable
     time_correlated_noise: TimeCorrelatedNoise | Unavailable
     axis_tunings: tuple[AxisTuning, ...] = ()
-    noisy_flight_part: NoisyPart | None = None
+    noisy_flight_part: NoisyFlightPart | None = None
     imu_oscillation: ImuOscillation | None = None
 
 
@@ -243,7 +243,10 @@ def _fit_source_errors(
     SourceLowPass | Unavailable,
     TimeCorrelatedNoise | Unavailable,
 ]:
-    """Fit biases, scale factor and jumps, then the time correlation of the remaining errors."""
+    """Fit biases, scale factor and jumps, then the time correlation of the remaining errors.
+
+    Each fit uses the results of the fit before.
+    """
     axes_and_tuning = _select_horizontal_axes(comparison, tuning)
     if isinstance(axes_and_tuning, Unavailable):
         return axes_and_tuning, axes_and_tuning, axes_and_tuning
@@ -285,6 +288,7 @@ def _fit_source_errors(
     )
     if isinstance(time_correlation_fit, Unavailable):
         return systematic_errors, time_correlation_fit, time_correlation_fit
+    # With ground truth, time-correlated noise is fitted to the errors of the positions
     source_low_pass, correlated_noise = time_correlation_fit
     truths = [comparison.axes[axis.name].truth for axis in axes]
     available_truths = [truth for truth in truths if not isinstance(truth, Unavailable)]
@@ -310,7 +314,7 @@ def _select_horizontal_axes(
     comparison: Comparison, tuning: TuningByAxis
 ) -> tuple[tuple[Axis, ...], AxisTuning] | Unavailable:
     """Return the horizontal axes and their common noise estimate."""
-    for name, axis_names in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
+    for name, axis_names in ((HORIZONTAL, ("north", "east")), (AISLE_AXIS, (AISLE_AXIS,))):
         axis_tuning = tuning.get(name)
         if isinstance(axis_tuning, AxisTuning) and comparison.axes.keys() >= set(axis_names):
             return tuple(comparison.axes[axis].axis for axis in axis_names), axis_tuning
@@ -355,6 +359,7 @@ def widen_for_scatter(time_offset: SourceTimeOffset, cause: str) -> SourceTimeOf
     """
     offsets_s = np.array([part.offset_s for part in time_offset.parts])
     weights = np.array([part.sigma_s**-2.0 for part in time_offset.parts])
+    # Too few parts to estimate the scatter. Drift and change cannot be distinguished from scatter
     if len(offsets_s) <= MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE:
         return structs.replace(
             time_offset, change_p_value=None, drift_ppm=None, drift_sigma_ppm=None
@@ -405,10 +410,10 @@ def _compute_change_p_value(offsets_s: Array, weights: Array) -> float | None:
             means_s.append(np.average(offsets_s[rows], weights=weights[rows]))
             square_sum += _compute_weighted_square_sum(offsets_s[rows], weights[rows])
             variance_sum += 1.0 / np.sum(weights[rows])
-        change_s = float(np.ptp(means_s))
-        if change_s < MIN_TIME_OFFSET_CHANGE_S:
+        offset_change_s = float(np.ptp(means_s))
+        if offset_change_s < MIN_TIME_OFFSET_CHANGE_S:
             continue
-        change_sigma_s = np.sqrt(max(1.0, square_sum / degrees_of_freedom) * variance_sum)
-        p_value = 2.0 * float(stdtr(degrees_of_freedom, -change_s / change_sigma_s))
+        offset_change_sigma_s = np.sqrt(max(1.0, square_sum / degrees_of_freedom) * variance_sum)
+        p_value = 2.0 * float(stdtr(degrees_of_freedom, -offset_change_s / offset_change_sigma_s))
         smallest_p_value = min(smallest_p_value, p_value * len(split_rows))
     return smallest_p_value if split_rows else None

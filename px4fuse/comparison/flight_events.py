@@ -71,13 +71,13 @@ def collect_events(comparison: Comparison) -> Events:
     resets = flight.ekf2.resets if isinstance(flight.ekf2, Ekf2) else ()
     return Events(
         gaps=find_source_gaps(time_s, comparison.source.compute_rate_hz()),
-        dropouts=segment.cut(
+        dropouts=segment.clip_spans(
             (dropout.start_s, dropout.start_s + dropout.duration_s)
             for dropout in flight.log.dropouts
         ),
         ground_spans_s=()
         if isinstance(flight.airborne, Unavailable)
-        else segment.cut(zip(flight_edges_s[::2], flight_edges_s[1::2], strict=True)),
+        else segment.clip_spans(zip(flight_edges_s[::2], flight_edges_s[1::2], strict=True)),
         take_off_times_s=tuple(start for start, _ in airborne_spans_s if start_s <= start <= end_s),
         landing_times_s=tuple(end for _, end in airborne_spans_s if start_s <= end <= end_s),
         reset_times_s=tuple(

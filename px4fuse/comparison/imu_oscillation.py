@@ -11,7 +11,11 @@ from px4fuse.flight.model import Columns, Unavailable
 
 MIN_POSITIONS = 100
 # Minimum and maximum tested frequency (Hz), and maximum tested frequency ÷ rate of the positions
-MIN_FREQUENCY_HZ, MAX_FREQUENCY_HZ, MAX_FREQUENCY_TO_RATE_RATIO = 0.1, 5.0, 0.45
+MIN_OSCILLATION_FREQUENCY_HZ, MAX_OSCILLATION_FREQUENCY_HZ, MAX_FREQUENCY_TO_RATE_RATIO = (
+    0.1,
+    5.0,
+    0.45,
+)
 # The power of a peak at frequency f is compared with the median power from f ÷ ratio to f · ratio
 BAND_LIMIT_RATIO = 1.33
 # Minimum power of a peak ÷ median power: in flights without an oscillation, the ratio is below 6
@@ -59,23 +63,29 @@ def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | Non
     rotation_to_vehicle_axes = np.exp(
         -1j * np.interp(time_s[1:-1], attitude.index.to_numpy(), headings_rad)
     )
+    # A second difference ÷ interval² is an acceleration
     window = np.hanning(len(rotation_to_vehicle_axes))
     second_differences_m = np.diff(positions_m, 2, axis=1) * rotation_to_vehicle_axes * window
     spectra = np.fft.fft([*second_differences_m, np.diff(second_differences_m, axis=0)[0]])
     count = len(rotation_to_vehicle_axes) // 2
     # The signals are complex: an oscillation along one axis has equal powers at positive and at
     # negative frequency. Add both
+    # Rows: source, IMU, and their difference. [:, -1] is the negative frequency of [:, 1]
     powers = np.abs(spectra[:, 1:count]) ** 2 + np.abs(spectra[:, :-count:-1]) ** 2
     source_power, imu_power, error_power = (np.convolve(row, np.ones(3), "same") for row in powers)
     frequencies_hz = np.arange(1, count) / (len(rotation_to_vehicle_axes) * interval_s)
     first, end = np.searchsorted(
         frequencies_hz,
-        [MIN_FREQUENCY_HZ, min(MAX_FREQUENCY_HZ, MAX_FREQUENCY_TO_RATE_RATIO / interval_s)],
+        [
+            MIN_OSCILLATION_FREQUENCY_HZ,
+            min(MAX_OSCILLATION_FREQUENCY_HZ, MAX_FREQUENCY_TO_RATE_RATIO / interval_s),
+        ],
     )
     peaks = 1 + np.flatnonzero(
         (error_power[1:-1] > error_power[:-2]) & (error_power[1:-1] > error_power[2:])
     )
     peaks = peaks[(peaks >= first) & (peaks < end)]
+    # Rows from frequency ÷ ratio to frequency · ratio, for each peak
     band_rows = np.searchsorted(
         frequencies_hz,
         np.outer([1.0 / BAND_LIMIT_RATIO, BAND_LIMIT_RATIO], frequencies_hz[peaks]),
@@ -89,6 +99,8 @@ def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | Non
     # The Hann window spreads an oscillation over 3 bins with 1.5 times the power of the middle bin.
     # Both signs of the frequency together: imu_power is 3 times the power of the middle bin
     amplitude_m = 2.0 * np.sqrt(imu_power[peak] / 3.0) / window.sum()
+    # Derivative ÷ difference of a sinusoid of this frequency; its square is the ratio for second
+    # differences
     acceleration_per_difference = np.pi * frequency_hz / np.sin(np.pi * frequency_hz * interval_s)
     oscillation = ImuOscillation(frequency_hz, float(amplitude_m * acceleration_per_difference**2))
     is_oscillating = (

@@ -12,8 +12,8 @@ from px4fuse.convention.model import Convention
 from px4fuse.core.record import (
     NOT_IN_JSON,
     Count,
+    NonNegativeFloat,
     NotInJson,
-    NotNegative,
     OrUnavailable,
     PositiveFloat,
     Record,
@@ -32,7 +32,7 @@ from px4fuse.filter.consistency import (
 )
 from px4fuse.filter.kalman import KfRun
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import AISLE, Axis, Segment, cut_to_segment
+from px4fuse.filter.signals import AISLE_AXIS, Axis, Segment, cut_to_segment
 from px4fuse.flight.model import Flight, PositionTrack, TableOrUnavailable
 
 FilterName = Literal["kf", "ekf2"]
@@ -74,11 +74,11 @@ class ErrorsAgainstTruth(Record, kw_only=True):
     """
 
     count: Count
-    position_rmse_m: NotNegative
-    velocity_rmse_m_s: NotNegative | None = None
-    nees_position_mean: NotNegative | None = None
-    nees_velocity_mean: NotNegative | None = None
-    nees_position_horizon_mean: NotNegative | None = None
+    position_rmse_m: NonNegativeFloat
+    velocity_rmse_m_s: NonNegativeFloat | None = None
+    nees_position_mean: NonNegativeFloat | None = None
+    nees_velocity_mean: NonNegativeFloat | None = None
+    nees_position_horizon_mean: NonNegativeFloat | None = None
 
     @property
     def has_only_lag_errors(self) -> bool:
@@ -121,16 +121,16 @@ class UntestedFilter(Unavailable, kw_only=True):
     truth: OrUnavailable[ErrorsAgainstTruth]
 
 
-class Difference(Record, kw_only=True):
+class FilterDifference(Record, kw_only=True):
     """Difference KF - EKF2 along one axis, at EKF2's sample times."""
 
     count: Count
-    position_rms_m: NotNegative
+    position_rms_m: NonNegativeFloat
     position_mean_m: float
-    position_maximum_m: NotNegative
-    velocity_rms_m_s: NotNegative
+    position_maximum_m: NonNegativeFloat
+    velocity_rms_m_s: NonNegativeFloat
     velocity_mean_m_s: float
-    velocity_maximum_m_s: NotNegative
+    velocity_maximum_m_s: NonNegativeFloat
 
 
 class UpdateStatistics(Record, kw_only=True):
@@ -143,7 +143,7 @@ class UpdateStatistics(Record, kw_only=True):
     first_s: float
     last_s: float
     rate_hz: PositiveFloat | None = None
-    input_gap_s: NotNegative
+    input_gap_s: NonNegativeFloat
 
 
 class AxisComparison(Record, kw_only=True):
@@ -168,7 +168,7 @@ class AxisComparison(Record, kw_only=True):
     note: str
     updates: UpdateStatistics
     filters: Mapping[FilterName, RecordOrUnavailable[FilterSummary, UntestedFilter]]
-    difference: OrUnavailable[Difference]
+    difference: OrUnavailable[FilterDifference]
     rejected_fraction: Share | None = None
     axis: NotInJson[Axis] = NOT_IN_JSON
     kf_run: NotInJson[KfRun] = NOT_IN_JSON
@@ -257,7 +257,7 @@ class Comparison(PreparedComparison):
     @property
     def main(self) -> AxisComparison:
         """Result along the axis of largest motion if analysed, else along the first axis."""
-        return self.axes.get(AISLE) or next(iter(self.axes.values()))
+        return self.axes.get(AISLE_AXIS) or next(iter(self.axes.values()))
 
 
 def select_north_and_east(comparison: Comparison) -> list[AxisComparison]:

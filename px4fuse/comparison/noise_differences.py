@@ -23,7 +23,7 @@ MAX_FLIGHT_PART_COUNT = 12
 MIN_PART_MEASUREMENTS = 25
 
 
-class NoisyPart(NamedTuple):
+class NoisyFlightPart(NamedTuple):
     """Time span (s) with larger innovations than the rest of the flight.
 
     ``sigma_ratio`` is σ of the innovations in the time span ÷ σ in the rest of the flight.
@@ -83,17 +83,19 @@ def _find_heading_of_largest_noise(north_and_east: Sequence[AxisComparison]) -> 
 
 def find_noisy_flight_part(
     comparison: Comparison, axis_tuning: AxisTuning | Unavailable | None
-) -> NoisyPart | None:
+) -> NoisyFlightPart | None:
     """Find a time span with larger innovations than in the rest of the flight."""
-    # Use KF's settings if the noises could not be estimated
-    settings, outlier_time_s = comparison.settings, np.zeros(0)
-    sigma_a: float | None = settings.sigma_a_m_s2
-    sigma_z: float | None = settings.sigma_z_m
+    axes = [axis_result.axis for axis_result in select_north_and_east(comparison)]
+    if axis_tuning is None or len(axes) < 2:
+        return None
+    settings = comparison.settings
     if isinstance(axis_tuning, AxisTuning):
         sigma_a, sigma_z = axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value
         outlier_time_s = axis_tuning.outlier_time_s
-    axes = [axis_result.axis for axis_result in select_north_and_east(comparison)]
-    if axis_tuning is None or sigma_a is None or sigma_z is None or len(axes) < 2:
+    else:  # use KF's settings
+        sigma_a, sigma_z = settings.sigma_a_m_s2, settings.sigma_z_m
+        outlier_time_s = np.zeros(0)
+    if sigma_a is None or sigma_z is None:
         return None
     axis_motions = [preintegrate(axis, settings) for axis in axes]
     time_s = axes[0].measurement_time_s[-len(axis_motions[0].measurement_m) :]
@@ -114,6 +116,8 @@ def find_noisy_flight_part(
     part_medians = np.array(
         [np.median(scaled_innovations[:, first:end]) for first, end in pairwise(part_edges)]
     )
+    # The limit is in the middle between the extreme medians on a logarithmic scale, so it separates
+    # two levels of noise
     noisy_parts = np.flatnonzero(part_medians > np.sqrt(part_medians.min() * part_medians.max()))
     # The noisy parts must be one continuous time span, but not the whole flight
     if len(noisy_parts) in (0, part_count) or np.ptp(noisy_parts) >= len(noisy_parts):
@@ -121,12 +125,14 @@ def find_noisy_flight_part(
     first_row, end_row = part_edges[noisy_parts[0]], part_edges[noisy_parts[-1] + 1]
     is_noisy = np.zeros(len(time_s), bool)
     is_noisy[first_row:end_row] = True
-    sigma_ratios = (
-        float(np.median(magnitudes[:, is_noisy]) / np.median(magnitudes[:, ~is_noisy]))
-        for magnitudes in (
-            scaled_innovations,
-            compute_scaled_innovations(np.isin(time_s, outlier_time_s)),
-        )
+
+    def compute_sigma_ratio(magnitudes: Array) -> float:
+        return float(np.median(magnitudes[:, is_noisy]) / np.median(magnitudes[:, ~is_noisy]))
+
+    innovations_without_outliers = compute_scaled_innovations(np.isin(time_s, outlier_time_s))
+    return NoisyFlightPart(
+        float(time_s[first_row]),
+        float(time_s[end_row - 1]),
+        compute_sigma_ratio(scaled_innovations),
+        compute_sigma_ratio(innovations_without_outliers),
     )
-    start_s, end_s = time_s[[first_row, end_row - 1]].tolist()
-    return NoisyPart(start_s, end_s, *sigma_ratios)

@@ -8,22 +8,23 @@ from msgspec import structs
 
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.projection import find_observation_variance
-from px4fuse.convention.check import check_convention
+from px4fuse.convention.check import determine_source_convention
 from px4fuse.convention.correction import convert_to_px4_convention, find_convention_faults
 from px4fuse.convention.model import Convention
-from px4fuse.core.text import capitalise_first
-from px4fuse.ekf2.fusion_conditions import constant_coordinates
+from px4fuse.core.record import Span
+from px4fuse.core.text import capitalise_first_letter
+from px4fuse.ekf2.fusion_conditions import find_constant_coordinates
 from px4fuse.errors import MissingDataError, SettingsError, suggest_name
 from px4fuse.filter.settings import SETTING_RANGES, Settings, requested_settings
 from px4fuse.filter.signals import (
-    AISLE,
+    AISLE_AXIS,
     MIN_MEASUREMENTS,
     Segment,
     cut_to_segment,
     interpolate_attitude,
     make_axes,
 )
-from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
+from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, MODEL_PARAMETERS
 from px4fuse.flight.model import (
     ALIGNED_BY_EKF2_ORIGIN,
     HEIGHT_ONLY_REASON,
@@ -44,9 +45,9 @@ from px4fuse.readers.px4_innovations import (
     replace_vision_by_gnss_innovations,
 )
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
-from px4fuse.readers.px4_topics import SOURCE_TRACKS
+from px4fuse.readers.px4_topics import SOURCE_TRACK_NAMES
 from px4fuse.request import ComparisonRequest, HeightName
-from px4fuse.trajectory.rotation import to_matrix
+from px4fuse.trajectory.rotation import to_rotation_matrix
 
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
@@ -54,7 +55,7 @@ NO_SEPARATE_TRUTH = Unavailable(
     "Choose another position source for KF with --position-source.",
 )
 # Default axes if the height of the source is constant or too noisy (GNSS)
-HORIZONTAL_AXES = (AISLE, "north", "east")
+HORIZONTAL_AXES = (AISLE_AXIS, "north", "east")
 
 
 def prepare_comparison_inputs(
@@ -85,20 +86,23 @@ def prepare_comparison_inputs(
     flight, source, settings, convention = _correct_convention(
         flight, source, settings, is_checked=not (keep_positions_as_sent or flight.log.is_assessed)
     )
+    # The order is important: lever arm and origin need positions in NED with correct timestamps,
+    # and the axes need the final heights
     source = _subtract_lever_arm(source, flight)
     source = _shift_vision_to_ekf2_origin(source, flight)
     source = _use_barometer_height(source, flight, request.height)
     flight = select_source_innovations(flight, source)
     segment = choose_segment(flight, source, request.start_s, request.end_s)
+    # GNSS heights are noisy, so they are analysed only on request
     is_gnss = source.origin.is_fused_as_gnss
-    has_no_height = is_gnss or "z" in constant_coordinates(source)
+    has_no_height = is_gnss or "z" in find_constant_coordinates(source)
     axis_names = request.axes or (HORIZONTAL_AXES if has_no_height else None)
     axes = make_axes(flight, source, segment, names=axis_names, heading_deg=request.heading_deg)
     if isinstance(flight.truth, Truth) and flight.truth.name == source.name:
         flight = replace(flight, truth=NO_SEPARATE_TRUTH)
     if is_gnss and request.sigma_z_m is None:
         # SIGMA_Z is √R of EKF2's GNSS fusion
-        default_noise_m = PARAMETERS[GNSS_POS.noise].default
+        default_noise_m = MODEL_PARAMETERS[GNSS_POS.noise].default
         sigma_z_m = (
             find_observation_variance(flight, source, axes[0], segment, default_noise_m) ** 0.5
         )
@@ -131,7 +135,9 @@ def _correct_convention(
     its own frame.
     """
     is_in_ned = source.origin.is_gnss or source.origin.route == ALIGNED_BY_EKF2_ORIGIN.route
-    convention = check_convention(flight, source) if is_checked and not is_in_ned else None
+    convention = (
+        determine_source_convention(flight, source) if is_checked and not is_in_ned else None
+    )
     # A time offset from the user replaces the detected one
     if convention is not None and settings.clock_offset_s:
         convention = structs.replace(convention, late_s=0.0)
@@ -152,7 +158,8 @@ def select_source_innovations(flight: Flight, track: PositionTrack) -> Flight:
     ekf2 = replace_vision_by_gnss_innovations(
         flight.ekf2, GNSS if track.barometer is None else GNSS_WITH_BAROMETER_HEIGHT
     )
-    # GNSS innovations replace those of vision, so missing vision innovations are not reported
+    # GNSS innovations replace those of vision, so missing vision innovations are not reported. Nor
+    # are missing position sources (entries with a source), because GNSS is the position source
     missing_vision_innovations, missing_gnss_innovations = (
         [item for item in each.innovations.values() if isinstance(item, Unavailable)]
         for each in (flight.ekf2, ekf2)
@@ -203,7 +210,7 @@ def _subtract_lever_arm(track: PositionTrack, flight: Flight) -> PositionTrack:
     if not any(track.lever_arm_m) or isinstance(attitude, Unavailable) or track.frame != "NED":
         return track
     quaternions = interpolate_attitude(attitude, track.samples.index.to_numpy())
-    lever_arm_ned_m = to_matrix(quaternions) @ track.lever_arm_m
+    lever_arm_ned_m = to_rotation_matrix(quaternions) @ track.lever_arm_m
     samples = track.samples.copy()
     samples[Columns.POSITION] -= lever_arm_ned_m
     forward_m, right_m, down_m = track.lever_arm_m
@@ -216,7 +223,7 @@ def _subtract_lever_arm(track: PositionTrack, flight: Flight) -> PositionTrack:
 
 def _shift_vision_to_ekf2_origin(track: PositionTrack, flight: Flight) -> PositionTrack:
     """Shift vision positions to EKF2's origin if EKF2 also fused GNSS."""
-    ekf2, samples = flight.ekf2, track.samples.copy()
+    ekf2, samples = flight.ekf2, track.samples
     if (
         track.frame != "NED"
         or not track.origin.is_vision
@@ -230,6 +237,7 @@ def _shift_vision_to_ekf2_origin(track: PositionTrack, flight: Flight) -> Positi
     ]
     if not np.isfinite(offset_m).all():
         return track
+    samples = samples.copy()
     samples[Columns.POSITION] -= offset_m
     origin_note = (
         f"positions of {track.name} were shifted to EKF2's origin by their median offset "
@@ -247,17 +255,17 @@ def _use_barometer_height(
         raise SettingsError(
             f"{log_name}: `height` needs GNSS as position source, not {track.name}."
         )
-    is_barometer_ekf2_height = has_fused_aid(ekf2, BAROMETER.name) and not has_fused_aid(
-        ekf2, GNSS.vertical_aid
-    )
+    if height_sensor == "barometer" and barometer_heights is None:
+        raise MissingDataError(
+            f"{log_name}: the log contains no barometer height.", GNSS["vertical"].logging_remedy
+        )
     uses_barometer = height_sensor == "barometer" or (
-        height_sensor is None and track.origin.is_fused_as_gnss and is_barometer_ekf2_height
+        height_sensor is None
+        and track.origin.is_fused_as_gnss
+        and has_fused_aid(ekf2, BAROMETER.name)
+        and not has_fused_aid(ekf2, GNSS["vertical"].aid)
     )
     if not uses_barometer or barometer_heights is None:
-        if height_sensor == "barometer":
-            raise MissingDataError(
-                f"{log_name}: the log contains no barometer height.", GNSS.logging_remedy
-            )
         return track
     offset_m = barometer_heights["down_m"].iloc[0]
     height_note = "heights are barometer heights relative to the first barometer sample"
@@ -278,7 +286,7 @@ def _use_barometer_height(
 
 def explain_missing_source(flight: Flight) -> Unavailable:
     """Return the reason why the log has no position source, and the action for the user."""
-    topics = f"{', '.join(SOURCE_TRACKS)}, and EKF2 innovations of external vision"
+    topics = f"{', '.join(SOURCE_TRACK_NAMES)}, and EKF2 innovations of external vision"
     remedy = (
         "set SDLOG_PROFILE to 129 and send the UWB position to PX4 as VISION_POSITION_ESTIMATE, or "
         "give the position file with --position."
@@ -289,11 +297,13 @@ def explain_missing_source(flight: Flight) -> Unavailable:
         remedy = (
             f"give the position file of the positioning system as argument `position`{or_ulog}."
         )
-    for track in flight.positions[:1]:
+    if flight.positions:
+        track = flight.positions[0]
         remedy = (
             f"use {track.name}, which EKF2 did not fuse (--position-source {track.name}), "
             f"or {remedy}"
         )
+    # Heights without positions replace the general reason. GNSS without a fix is an additional one
     reason = f"no external position in this log (possible sources: {topics})"
     for item in flight.missing:
         if item.reason == HEIGHT_ONLY_REASON:
@@ -306,7 +316,7 @@ def explain_missing_source(flight: Flight) -> Unavailable:
         reason = f"the file is damaged, and {reason}"
     if flight.log.autopilot != "PX4":
         reason += f"; the autopilot is {flight.log.autopilot}, so there is no EKF2"
-    return Unavailable("position source", reason, capitalise_first(remedy))
+    return Unavailable("position source", reason, capitalise_first_letter(remedy))
 
 
 def _explain_choice(track: PositionTrack) -> str:
@@ -341,43 +351,14 @@ def choose_segment(
     SettingsError
         The segment is empty or contains fewer than three measurements.
     """
-    source_span_s, log = track.samples.index[[0, -1]].tolist(), flight.log
-    available_start_s = max(source_span_s[0], 0.0)
-    available_end_s = min(source_span_s[1], log.duration_s)
-    chosen_start_s, chosen_end_s = available_start_s, available_end_s
-    reason = "the whole time span with positions, because "
-    if isinstance(flight.airborne, Unavailable):
-        reason += "the log contains no land detector"
-    elif not flight.airborne:
-        reason += "the vehicle stayed on the ground"
-    else:
-        flight_spans_s = join_flights(flight.airborne)
-        flight_start_s, flight_end_s = max(
-            flight_spans_s,
-            key=lambda span: min(span[1], available_end_s) - max(span[0], available_start_s),
-        )
-        if max(flight_start_s, available_start_s) < min(flight_end_s, available_end_s):
-            chosen_start_s, chosen_end_s = flight_start_s, flight_end_s
-            reason = "positions available and vehicle airborne"
-            other_flight_texts = [
-                f"{start_s:.1f} to {end_s:.1f} s (--start {start_s:.1f} --end {end_s:.1f})"
-                for start_s, end_s in flight_spans_s
-                if start_s != flight_start_s
-            ]
-            if other_flight_texts:
-                reason += (
-                    f"; this is the longest of {len(flight_spans_s)} flights; the others: "
-                    f"{', '.join(other_flight_texts)}"
-                )
-        else:
-            chosen_start_s = min(flight_start_s, available_start_s)
-            chosen_end_s = max(flight_end_s, available_end_s)
-            reason += "there are no positions in flight"
     if start_s is not None and end_s is not None and end_s <= start_s:
         raise SettingsError(
             f"The end ({end_s:.6g} s) is not after the start ({start_s:.6g} s).",
             "Change --start or --end.",
         )
+    source_span_s, log = track.samples.index[[0, -1]].tolist(), flight.log
+    available_span_s = max(source_span_s[0], 0.0), min(source_span_s[1], log.duration_s)
+    (chosen_start_s, chosen_end_s), reason = _choose_default_span(flight, available_span_s)
     options = {"--start": start_s, "--end": end_s}
     if given_options := [name for name, time_s in options.items() if time_s is not None]:
         chosen_start_s = chosen_start_s if start_s is None else start_s
@@ -389,8 +370,8 @@ def choose_segment(
             chosen_start_s, chosen_end_s = clipped_span_s
             reason += "; the log covers only part of the chosen time"
     segment = Segment(
-        max(chosen_start_s, available_start_s),
-        min(chosen_end_s, available_end_s),
+        max(chosen_start_s, available_span_s[0]),
+        min(chosen_end_s, available_span_s[1]),
         reason,
         (chosen_start_s, chosen_end_s),
     )
@@ -404,3 +385,38 @@ def choose_segment(
             "Change --start or --end.",
         )
     return segment
+
+
+def _choose_default_span(flight: Flight, available_span_s: Span) -> tuple[Span, str]:
+    """Return the span of the flight with the longest time of available positions, and the reason.
+
+    Return the whole span if no flight has positions.
+    """
+    reason = "the whole time span with positions, because "
+    if isinstance(flight.airborne, Unavailable):
+        return available_span_s, f"{reason}the log contains no land detector"
+    if not flight.airborne:
+        return available_span_s, f"{reason}the vehicle stayed on the ground"
+    available_start_s, available_end_s = available_span_s
+
+    def compute_duration_with_positions_s(span_s: Span) -> float:
+        return min(span_s[1], available_end_s) - max(span_s[0], available_start_s)
+
+    flight_spans_s = join_flights(flight.airborne)
+    longest_span_s = max(flight_spans_s, key=compute_duration_with_positions_s)
+    if compute_duration_with_positions_s(longest_span_s) <= 0.0:
+        start_s, end_s = longest_span_s
+        whole_span_s = min(start_s, available_start_s), max(end_s, available_end_s)
+        return whole_span_s, f"{reason}there are no positions in flight"
+    reason = "positions available and vehicle airborne"
+    other_flight_texts = [
+        f"{start_s:.1f} to {end_s:.1f} s (--start {start_s:.1f} --end {end_s:.1f})"
+        for start_s, end_s in flight_spans_s
+        if start_s != longest_span_s[0]
+    ]
+    if other_flight_texts:
+        reason += (
+            f"; this is the longest of {len(flight_spans_s)} flights; the others: "
+            f"{', '.join(other_flight_texts)}"
+        )
+    return longest_span_s, reason

@@ -9,7 +9,7 @@ import pandas as pd
 
 from px4fuse.core.arrays import Array
 from px4fuse.ekf2.heights import GNSS_HEIGHT_NOISE_FACTOR
-from px4fuse.filter.signals import AISLE, Axis, Segment, cut_to_segment, weighted_sum
+from px4fuse.filter.signals import AISLE_AXIS, Axis, Segment, cut_to_segment, weighted_sum
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS
 from px4fuse.flight.model import (
     AXIS_NAMES,
@@ -34,7 +34,7 @@ PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
 }
 # Resets are removed from EKF2's track if this reduces the median squared distance between track
 # and measured positions to less than this fraction
-MAX_DISTANCE_RATIO_WITHOUT_RESETS = 0.95
+MAX_SQUARED_DISTANCE_RATIO_WITHOUT_RESETS = 0.95
 
 
 def remove_origin_resets(
@@ -55,9 +55,7 @@ def remove_origin_resets(
         reset for reset in ekf2.resets if segment.start_s < reset.time_s <= segment.end_s
     ]
     state = ekf2.state.copy() if resets_in_segment else ekf2.state
-    removed = "removed from EKF2's track: the resets only move the origin of EKF2's frame"
-    kept = "kept: the resets correct an error of EKF2"
-    texts_by_reset_treatment: dict[str, list[str]] = {removed: [], kept: []}
+    removed_texts, kept_texts = list[str](), list[str]()
     for label, quantity, columns in (
         ("horizontal position", "position", Columns.POSITION[:2]),
         ("height", "position", Columns.POSITION[2:]),
@@ -72,7 +70,7 @@ def remove_origin_resets(
         ]
         if not resets:
             continue
-        reset_treatment = kept
+        texts = kept_texts
         if quantity == "position":  # a velocity does not depend on the origin
             samples = cut_to_segment(track.samples, segment)[columns].dropna()
             compute_squared_distance_m2 = partial(_compute_squared_distance_m2, samples)
@@ -80,12 +78,18 @@ def remove_origin_resets(
             closest_state = min(candidates, key=compute_squared_distance_m2)
             if compute_squared_distance_m2(
                 closest_state
-            ) < MAX_DISTANCE_RATIO_WITHOUT_RESETS * compute_squared_distance_m2(ekf2.state):
-                state[columns], reset_treatment = closest_state, removed
-        texts_by_reset_treatment[reset_treatment].append(f"{len(resets)} of {label}")
+            ) < MAX_SQUARED_DISTANCE_RATIO_WITHOUT_RESETS * compute_squared_distance_m2(ekf2.state):
+                state[columns], texts = closest_state, removed_texts
+        texts.append(f"{len(resets)} of {label}")
     statements = (
-        f"Jumps by EKF2 resets ({', '.join(texts)}) are {reset_treatment}"
-        for reset_treatment, texts in texts_by_reset_treatment.items()
+        f"Jumps by EKF2 resets ({', '.join(texts)}) are {treatment}"
+        for texts, treatment in (
+            (
+                removed_texts,
+                "removed from EKF2's track: the resets only move the origin of EKF2's frame",
+            ),
+            (kept_texts, "kept: the resets correct an error of EKF2"),
+        )
         if texts
     )
     return state, ". ".join(statements)
@@ -205,12 +209,12 @@ def project_innovations(
             "Choose the source that EKF2 fused (--position-source).",
         )
     axis_innovations = []
-    for name in ("north", "east") if axis.name == AISLE else (axis.name,):
+    for name in ("north", "east") if axis.name == AISLE_AXIS else (axis.name,):
         if isinstance(innovations := ekf2.innovations[name], Unavailable):
             return innovations
         axis_innovations.append(innovations)
     rows = cut_to_segment(axis_innovations[0], segment)
-    if axis.name == AISLE:
+    if axis.name == AISLE_AXIS:
         rows = _combine_north_and_east(rows, axis_innovations[1], axis.direction)
     if rows.empty:
         return _make_no_samples_result("EKF2 innovations")

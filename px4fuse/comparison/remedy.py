@@ -11,7 +11,7 @@ from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import Ekf2Model, replay_with_settings
 from px4fuse.ekf2.replay import rows_inside
-from px4fuse.filter.signals import AISLE
+from px4fuse.filter.signals import AISLE_AXIS
 from px4fuse.filter.time_offset import MIN_OFFSET_SIGMAS, MIN_TIME_OFFSET_S, SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL, NoiseEstimate
 from px4fuse.flight.ekf2_parameters import (
@@ -19,7 +19,7 @@ from px4fuse.flight.ekf2_parameters import (
     GNSS_POS,
     GNSS_VEL,
     KNOWN_PARAMETERS,
-    PARAMETERS,
+    MODEL_PARAMETERS,
     Aid,
 )
 from px4fuse.flight.model import Unavailable
@@ -75,15 +75,19 @@ def estimate_gnss_delay_ms(
             for axis in ("north", "east")
             for updates in update_tables
         ]
-        # Scale the mean to the same number of samples in all replays
+        # NIS sum over velocity and position: the mean, times the equal number of samples in all
+        # replays
         nis_sums.append(float(np.mean(nis)) * len(nis) * len(received_positions.timestamp_s))
+    # NIS sum = -2 ln p = (delay - estimate)² / σ² + constant
     quadratic_coefficient, linear_coefficient, _ = np.polyfit(GNSS_DELAYS_MS, nis_sums, 2)
     if quadratic_coefficient <= 0.0:
         return None
     delay_ms = -0.5 * linear_coefficient / quadratic_coefficient
     sigma_ms = quadratic_coefficient**-0.5
-    error_ms = abs(delay_ms - model.inputs.settings[GNSS_POS.delay])
-    if delay_ms < 0.0 or error_ms <= max(1e3 * MIN_TIME_OFFSET_S, MIN_OFFSET_SIGMAS * sigma_ms):
+    delay_setting_error_ms = abs(delay_ms - model.inputs.settings[GNSS_POS.delay])
+    if delay_ms < 0.0 or delay_setting_error_ms <= max(
+        1e3 * MIN_TIME_OFFSET_S, MIN_OFFSET_SIGMAS * sigma_ms
+    ):
         return None
     return delay_ms, sigma_ms
 
@@ -109,7 +113,8 @@ def estimate_ekf2_parameters(
         inputs = replace(inputs, aid=EV_POS, received_positions=vision)
     if not is_source_fused(comparison, inputs):
         return {}
-    axis_tuning = find_first_available_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
+    axis_tuning = find_first_available_tuning(tuning, HORIZONTAL, AISLE_AXIS, "north", "east")
+    # With GNSS, a noise of vision below that of GNSS has no effect
     used_noise_m = find_used_noise_m(inputs)
     min_noise_m = used_noise_m if origin.may_drift or origin.is_gnss else 0.0
     if (
@@ -164,7 +169,7 @@ def describe_delay_limit(
     parameter_name: str, estimated_delay_ms: float, logged_delay_ms: float
 ) -> str:
     """Return the reason why PX4 does not permit a delay: "exceed 300 ms", "be negative" or ""."""
-    if estimated_delay_ms > (maximum_ms := PARAMETERS[parameter_name].maximum):
+    if estimated_delay_ms > (maximum_ms := MODEL_PARAMETERS[parameter_name].maximum):
         return f"exceed {maximum_ms:g} ms"
     return "be negative" if round(estimated_delay_ms) <= 0.0 == logged_delay_ms else ""
 
@@ -223,7 +228,7 @@ def make_noise_change(
 
     EKF2 then ignores a larger noise that the sender reports.
     """
-    changes = {aid.noise: max(float(f"{noise_m:.2g}"), PARAMETERS[aid.noise].minimum)}
+    changes = {aid.noise: max(float(f"{noise_m:.2g}"), MODEL_PARAMETERS[aid.noise].minimum)}
     mode_parameter = aid.noise_mode_parameter
     if mode_parameter and not settings.get(mode_parameter, 0.0) and noise_m < reported_noise_m:
         changes[mode_parameter] = 1.0
@@ -233,7 +238,7 @@ def make_noise_change(
 def make_delay_change(ekf2_inputs: ReplayInputs, delay_ms: float) -> dict[str, float]:
     """Return the EKF2 parameters for a delay of the positions, if PX4 permits the delay."""
     delay_name = ekf2_inputs.aid.delay
-    parameter = PARAMETERS[delay_name]
+    parameter = MODEL_PARAMETERS[delay_name]
     if delay_ms > parameter.maximum or ekf2_inputs.received_positions.uses_sender_timestamps:
         return {}
     changes = {delay_name: max(float(round(delay_ms)), parameter.minimum)}

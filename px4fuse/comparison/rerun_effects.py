@@ -7,16 +7,16 @@ from typing import Literal
 import numpy as np
 
 from px4fuse.comparison.model import FilterName
-from px4fuse.core.record import Count, NotNegative, PositiveFloat, Record, Share
+from px4fuse.core.record import Count, NonNegativeFloat, PositiveFloat, Record, Share
 from px4fuse.filter.consistency import Reference, classify_sigma_ratio, compute_nis_band
 from px4fuse.flight.ekf2_parameters import EV_POS
 
 Statistic = Literal["nis", "nees", "difference"]
 CONSISTENCY_STATISTICS: tuple[Statistic, Statistic] = ("nees", "nis")
 # Changed KF settings, EKF2 parameters or data, by name
-Change = Mapping[str, float]
-# Names of data corrections in a Change: time offset (s), clockwise rotation of the positions (°),
-# number of omitted outliers, and accelerometer bias (m/s²)
+ChangedValues = Mapping[str, float]
+# Names of data corrections in ChangedValues: time offset (s), clockwise rotation of the positions
+# (°), number of omitted outliers, and accelerometer bias (m/s²)
 TIME_OFFSET_KEY, ROTATION_KEY, OUTLIERS_KEY = "clock_offset_s", "turned_deg", "outliers_left_out"
 FORWARD_BIAS_KEY, RIGHT_BIAS_KEY = "bias_forward_m_s2", "bias_right_m_s2"
 Improvement = Literal["position and σ", "position", "σ only", "nothing"]
@@ -56,9 +56,9 @@ class RunStatistics(Record, kw_only=True):
 
     innovations: Count = 0
     nis_mean: PositiveFloat | None = None
-    position_rmse_m: NotNegative | None = None
-    nees_mean: NotNegative | None = None
-    difference_rms_m: NotNegative | None = None
+    position_rmse_m: NonNegativeFloat | None = None
+    nees_mean: NonNegativeFloat | None = None
+    difference_rms_m: NonNegativeFloat | None = None
     rejected_fraction: Share | None = None
 
     def value(self, statistic: Statistic) -> float | None:
@@ -91,7 +91,7 @@ class Rerun(Record, kw_only=True):
     filter: FilterName
     axis: str
     kinds: tuple[str, ...]
-    change: Change
+    change: ChangedValues
     discrepancies: tuple[Statistic, ...] = ()
     before: RunStatistics
     is_logged: bool = True
@@ -166,6 +166,8 @@ def find_cause_rerun(
             rerun.corrects_sensor
             and explained_fraction_error <= ONLY_CAUSE_EXPLAINED_FRACTION_TOLERANCE
         )
+        # The smallest tuple is the best: first sufficient re-runs, then few changes, then corrected
+        # sensor faults, then the smallest remaining inconsistency
         return (
             not (is_complete or brings_inside_limits(rerun, statistic)),
             len(rerun.change.keys() - CHANGE_KEYS_WITHOUT_EFFECT_ALONE),

@@ -31,8 +31,8 @@ from px4fuse.comparison.estimates import Estimates, TuningByAxis
 from px4fuse.comparison.model import (
     AxisComparison,
     Comparison,
-    Difference,
     ErrorsAgainstTruth,
+    FilterDifference,
     FilterName,
     FilterSummary,
     PreparedComparison,
@@ -48,14 +48,14 @@ from px4fuse.comparison.rerun_effects import (
     RIGHT_BIAS_KEY,
     ROTATION_KEY,
     TIME_OFFSET_KEY,
-    Change,
+    ChangedValues,
     Rerun,
     RunStatistics,
     Statistic,
     find_partial_corrections,
 )
 from px4fuse.core.arrays import Array
-from px4fuse.ekf2.filter_recursion import FilterConfiguration
+from px4fuse.ekf2.filter_batch import FilterConfiguration
 from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import Ekf2Model, misalign_positions, replay_with_settings
 from px4fuse.ekf2.replay import HORIZONTAL_AXES, Ekf2Replay, rows_inside
@@ -70,7 +70,7 @@ from px4fuse.filter.signals import (
 )
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL
-from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
 from px4fuse.flight.model import Columns, Spans, Unavailable
 
 # Mean NIS above which innovations are too large for the reported σ
@@ -127,7 +127,7 @@ class _Filter(NamedTuple):
     """KF or EKF2, and a function that re-runs the filter with a change."""
 
     name: FilterName
-    rerun: Callable[[AxisComparison, Change], RunStatistics]
+    rerun: Callable[[AxisComparison, ChangedValues], RunStatistics]
     # For EKF2 only: inputs of the replay, and evaluated time spans (s)
     ekf2_inputs: ReplayInputs | None = None
     evaluated_spans_s: Spans | None = None
@@ -149,7 +149,7 @@ def rerun_filters(
     ):
         replays: dict[frozenset[tuple[str, float]], Ekf2Replay] = {}
 
-        def rerun_ekf2(axis_result: AxisComparison, change: Change) -> RunStatistics:
+        def rerun_ekf2(axis_result: AxisComparison, change: ChangedValues) -> RunStatistics:
             change_key = frozenset(change.items())
             if change_key not in replays:
                 replays[change_key] = _replay_ekf2(comparison, estimates.tuning, model, change)
@@ -204,15 +204,13 @@ def _find_changes_to_test(
     estimates: Estimates,
     ekf2_inputs: ReplayInputs | None,
     axis_result: AxisComparison,
-) -> list[tuple[Change, tuple[Statistic, ...]]]:
+) -> list[tuple[ChangedValues, tuple[Statistic, ...]]]:
     """Return the changes to test along an axis, and the statistics that each change may correct.
 
     ``ekf2_inputs`` is None for KF.
     """
-    axis, summary = (
-        axis_result.axis.name,
-        axis_result.filters["kf" if ekf2_inputs is None else "ekf2"],
-    )
+    axis = axis_result.axis.name
+    summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
     if not isinstance(summary, FilterSummary) or (ekf2_inputs is not None and axis == "down"):
         return []  # EKF2's replay contains no vertical position
     statistics: list[Statistic] = ["nees"] if find_error_above_sigma(summary) else []
@@ -224,8 +222,9 @@ def _find_changes_to_test(
         )
         for statistic in statistics
     }
-    changes = remove_repeated_changes(chain.from_iterable(candidates.values()))
-    if axis_result is comparison.main:
+    if axis_result is not comparison.main:
+        changes = remove_repeated_changes(chain.from_iterable(candidates.values()))
+    else:
         changes = find_main_axis_changes(comparison, estimates, ekf2_inputs, axis, summary)
     return [
         (change, tuple(statistic for statistic in statistics if change in candidates[statistic]))
@@ -242,10 +241,10 @@ def _rerun_with_changes(
     changes = _find_changes_to_test(comparison, estimates, tested_filter.ekf2_inputs, axis_result)
     if not changes:
         return []
-    original_statistics, is_logged = _find_statistics_without_change(tested_filter, axis_result)
+    original_statistics, is_logged = _find_statistics_of_unchanged_run(tested_filter, axis_result)
     spans_s = tested_filter.evaluated_spans_s
 
-    def make_rerun(change: Change, discrepancies: Iterable[Statistic]) -> Rerun:
+    def make_rerun(change: ChangedValues, discrepancies: Iterable[Statistic]) -> Rerun:
         changed_statistics = tested_filter.rerun(axis_result, change)
         return Rerun(
             filter=tested_filter.name,
@@ -264,6 +263,7 @@ def _rerun_with_changes(
         )
 
     reruns = [make_rerun(change, discrepancies) for change, discrepancies in changes]
+    # If no change alone is sufficient, combine the best change with each other helpful change
     for statistic in CONSISTENCY_STATISTICS:
         helpful_reruns = find_partial_corrections(reruns, statistic)
         reruns += [
@@ -273,7 +273,7 @@ def _rerun_with_changes(
     return reruns
 
 
-def _find_statistics_without_change(
+def _find_statistics_of_unchanged_run(
     tested_filter: _Filter, axis_result: AxisComparison
 ) -> tuple[RunStatistics, bool]:
     """Return the statistics with which the re-runs of a filter are compared.
@@ -284,7 +284,7 @@ def _find_statistics_without_change(
     """
     replayed, ekf2 = tested_filter.rerun(axis_result, {}), axis_result.ekf2_tracks
     evaluated_spans_s, innovations = tested_filter.evaluated_spans_s, ekf2.innovations
-    if evaluated_spans_s is None:
+    if evaluated_spans_s is None:  # KF
         return replayed, True
     if isinstance(ekf2.state, Unavailable) or isinstance(innovations, Unavailable):
         return replayed, False
@@ -298,6 +298,7 @@ def _find_statistics_without_change(
         compute_difference_statistics(axis_result.kf_run, logged_state),
         float((rejected_flags > 0.0).mean()) if len(rejected_flags) else None,
     )
+    # A statistic that is not logged is not compared
     is_replay_similar = all(
         logged_value and replayed_value and 1.0 / limit <= logged_value / replayed_value <= limit
         for logged_value, replayed_value, limit in (
@@ -314,7 +315,7 @@ def _summarise_run(
     innovation_m: Array,
     innovation_variance_m2: Array,
     errors: ErrorsAgainstTruth | Unavailable,
-    kf_minus_ekf2: Difference | Unavailable | None,
+    kf_minus_ekf2: FilterDifference | Unavailable | None,
     rejected_fraction: float | None = None,
 ) -> RunStatistics:
     nis = innovation_m**2 / innovation_variance_m2
@@ -333,13 +334,14 @@ def _rotate_direction(direction: Array, rotation_deg: float) -> Array:
 
 
 def _rerun_kf(
-    comparison: Comparison, tuning: TuningByAxis, axis_result: AxisComparison, change: Change
+    comparison: Comparison, tuning: TuningByAxis, axis_result: AxisComparison, change: ChangedValues
 ) -> RunStatistics:
     axis, truth, ekf2_state = axis_result.axis, axis_result.truth, axis_result.ekf2_tracks.state
     kf_settings: dict[str, Any] = {
         name: change[name] for name in change if name in vars(Settings())
     }
     changed_settings = replace(comparison.settings, **kf_settings)
+    # Apply the corrections of the data in sequence: rotation, bias, outliers, time offset
     rotates_gnss_positions = ROTATION_KEY in change and comparison.source.origin.is_gnss
     if ROTATION_KEY in change:
         rotated_direction = _rotate_direction(axis.direction, change[ROTATION_KEY])
@@ -372,7 +374,7 @@ def _rerun_kf(
 
 
 def _remove_accelerometer_bias(
-    comparison: Comparison, change: Change
+    comparison: Comparison, change: ChangedValues
 ) -> Acceleration | Unavailable:
     flight, imu = comparison.flight, comparison.flight.imu
     if isinstance(imu, Unavailable):
@@ -385,14 +387,16 @@ def _remove_accelerometer_bias(
 
 
 def _replay_ekf2(
-    comparison: Comparison, tuning: TuningByAxis, model: Ekf2Model, change: Change
+    comparison: Comparison, tuning: TuningByAxis, model: Ekf2Model, change: ChangedValues
 ) -> Ekf2Replay:
     if not change:
         return model.baseline_replay
-    changed_parameters = {name: value for name, value in change.items() if name in PARAMETERS}
+    changed_parameters = {name: value for name, value in change.items() if name in MODEL_PARAMETERS}
     model_with_moved_positions = misalign_positions(
         model, change.get(ROTATION_KEY, 0.0), change.get(TIME_OFFSET_KEY, 0.0)
     )
+    # Convert the outlier times from KF's timestamps to those of the replay: without KF's time
+    # offset, with the tested time offset, and for GNSS with the delay that KF subtracts
     excluded_times_s, axis_tuning = None, find_axis_tuning(tuning, HORIZONTAL)
     if OUTLIERS_KEY in change and axis_tuning is not None:
         excluded_times_s = axis_tuning.outlier_time_s - comparison.settings.clock_offset_s
@@ -410,7 +414,7 @@ def _summarise_replay(
     model: Ekf2Model,
     ekf2_replay: Ekf2Replay,
     axis_result: AxisComparison,
-    change: Change,
+    change: ChangedValues,
 ) -> RunStatistics:
     """Compute the statistics of a replay of EKF2 along one axis.
 
@@ -428,6 +432,7 @@ def _summarise_replay(
         )
         for name in ("innovation_variance", "observation_variance", "position_variance")
     )
+    # P⁻ = S - R
     prior_variance_m2 = innovation_variance_m2 - observation_variance_m2
     variance_by_time = pd.DataFrame(
         {

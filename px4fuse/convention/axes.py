@@ -22,7 +22,7 @@ from px4fuse.convention.motion import (
     ImuSecondDifferences,
     SourceSecondDifferences,
 )
-from px4fuse.core.arrays import Array, ArrayPair, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, ComplexArray, IntArray
 
 # Maximum tested time offset (s) of the positions
 MAX_TIME_OFFSET_S = 10.0
@@ -37,6 +37,7 @@ STUDENT_DEGREES_OF_FREEDOM = 4.0
 METRES_PER_UNIT: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
 # A frame that is rotated from NED by at most this angle (rad) is a misaligned NED frame
 SMALL_ROTATION_RAD = np.radians(8.0)
+
 # Time offsets up to this value (s) are equally probable a priori
 SMALL_TIME_OFFSET_S = 0.3
 # Log prior odds of a frame that is rotated by more than SMALL_ROTATION_RAD
@@ -63,6 +64,8 @@ MAX_REFINEMENT_ITERATIONS = 7
 MIN_SCORE_CHANGE = 0.01
 # Maximum change (s) of the time offset in one Gauss-Newton iteration
 MAX_TIME_OFFSET_STEP_S = 0.15
+# Indices of Hypothesis.parameters; the last three parameters are the accelerometer bias
+DELAY, HEADING, HEADING_DRIFT, CLOCK_DRIFT = range(4)
 # Prior precision (σ⁻²) of Hypothesis.parameters: gyroscope heading drift (0.05 °/s), accelerometer
 # bias (0.3 m/s²)
 PARAMETER_PRIOR_PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2] * 3])
@@ -100,6 +103,13 @@ class SignedAxisPermutation(NamedTuple):
     @property
     def is_mirrored(self) -> bool:
         return (self.vertical_sign * self.handedness < 0) != (self.vertical_axis == 1)
+
+    def combine_horizontal_axes(self, positions: Array) -> ComplexArray:
+        """Return first + i·second horizontal axis; times e^{i·heading}, it is north + i·east."""
+        return (
+            positions[:, self.first_horizontal_axis]
+            + 1j * self.handedness * positions[:, self.second_horizontal_axis]
+        )
 
     def compute_axis_directions(self, quarter_turns: int) -> AxisDirections:
         """Return the directions of x, y, z.
@@ -186,12 +196,12 @@ class Hypothesis:
     @property
     def delay_s(self) -> float:
         """Time (s) by which the timestamps are later than the measurements."""
-        return float(self.parameters[0])
+        return float(self.parameters[DELAY])
 
     @property
     def quarter_turns(self) -> int:
         """Heading of the first horizontal axis, rounded to multiples of 90° (0: north, 1: east)."""
-        return round(float(self.parameters[1]) / (np.pi / 2.0))
+        return round(float(self.parameters[HEADING]) / (np.pi / 2.0))
 
     @property
     def axes(self) -> AxisDirections:
@@ -201,13 +211,13 @@ class Hypothesis:
     @property
     def heading_minus_quarter_turns_rad(self) -> float:
         """Heading (rad) of the first horizontal axis minus the nearest multiple of 90°."""
-        return float(self.parameters[1] - self.quarter_turns * np.pi / 2.0)
+        return float(self.parameters[HEADING] - self.quarter_turns * np.pi / 2.0)
 
     def is_similar_to(self, other: "Hypothesis", max_difference_rad: float = np.pi / 4.0) -> bool:
-        heading_difference_rad = np.angle(np.exp(1j * (self.parameters[1] - other.parameters[1])))
+        heading_difference_rad = self.parameters[HEADING] - other.parameters[HEADING]
         return bool(
             abs(self.delay_s - other.delay_s) < 0.5
-            and abs(heading_difference_rad) < max_difference_rad
+            and abs(np.angle(np.exp(1j * heading_difference_rad))) < max_difference_rad
             and (self.axis_permutation, self.unit) == (other.axis_permutation, other.unit)
         )
 
@@ -223,110 +233,79 @@ def search_hypotheses(
     imu_motion_by_heading_source: Mapping[HeadingSource, ImuSecondDifferences],
 ) -> list[Hypothesis]:
     """Return the likely hypotheses on axes, unit and delay of the positions, best first."""
-    hypotheses = []
+    hypotheses = list[Hypothesis]()
     for heading_from, imu_motion in imu_motion_by_heading_source.items():
         source_motion = positions.compute_second_differences(imu_motion)
         for candidate in find_convention_candidates(source_motion, imu_motion):
             start_hypotheses = [replace(candidate, heading_from=heading_from)]
-            if abs(candidate.heading_minus_quarter_turns_rad) < 3.0 * SMALL_ROTATION_RAD:
+            # If the first estimate of the rotation is small, also test a heading that is fixed to a
+            # multiple of 90°: this hypothesis has one parameter less
+            rotation_rad = candidate.heading_minus_quarter_turns_rad
+            if abs(rotation_rad) < 3.0 * SMALL_ROTATION_RAD:
                 parameters = candidate.parameters.copy()
-                parameters[1] -= candidate.heading_minus_quarter_turns_rad
+                parameters[HEADING] -= rotation_rad
                 start_hypotheses.append(
                     replace(start_hypotheses[0], parameters=parameters, has_rotation=False)
                 )
-            hypotheses += [
+            hypotheses += (
                 refine_hypothesis(start_hypothesis, positions, source_motion, imu_motion)
                 for start_hypothesis in start_hypotheses
-            ]
+            )
     return sorted(
         (hypothesis for hypothesis in hypotheses if hypothesis.score > -np.inf),
         key=lambda hypothesis: -hypothesis.score,
     )
 
 
+def _compute_cross_moments(source_values: Array, imu_values: Array) -> Array:
+    """Return Σ source·IMU at each time offset, for each source column and each IMU column."""
+    windows = np.lib.stride_tricks.sliding_window_view(source_values, len(imu_values), axis=0)
+    return windows @ imu_values
+
+
 def find_convention_candidates(
     source_motion: SourceSecondDifferences, imu_motion: ImuSecondDifferences
 ) -> list[Hypothesis]:
     """Return the likely combinations of axes, unit and time offset, most likely first."""
-    source_columns_for_cross_moments = np.column_stack(
-        [
-            source_motion.second_differences,
-            source_motion.second_differences**2,
-            source_motion.is_valid,
-        ]
+    # Invalid second differences are 0
+    source, imu_m = source_motion.second_differences, imu_motion.table[..., 0].copy()
+    source_is_valid, imu_is_valid = (
+        motion.is_valid[:, None].astype(float) for motion in (source_motion, imu_motion)
     )
-    imu_columns_for_cross_moments = np.column_stack(
-        [imu_motion.table[..., 0], imu_motion.table[..., 0] ** 2, imu_motion.is_valid]
-    )
-    offset_steps = np.arange(
-        len(source_columns_for_cross_moments) - len(imu_columns_for_cross_moments) + 1
-    )
-    cross_moments = np.stack(
-        [
-            source_columns_for_cross_moments[step : step + len(imu_columns_for_cross_moments)].T
-            @ imu_columns_for_cross_moments
-            for step in offset_steps
-        ]
-    )
-    # cross_moments[:, 6, 6] is the number of common samples
-    has_overlap = cross_moments[:, 6, 6] * GRID_INTERVAL_S >= MIN_OVERLAP_S
+    common_sample_counts = _compute_cross_moments(source_is_valid, imu_is_valid)
+
+    has_overlap = common_sample_counts[:, 0, 0] * GRID_INTERVAL_S >= MIN_OVERLAP_S
     if not has_overlap.any():
         return []
-    delay_s = (offset_steps[has_overlap] - offset_steps[-1] / 2.0) * GRID_INTERVAL_S
-    cross_moments = cross_moments[has_overlap]
-    independent_residual_count = cross_moments[:, 6, 6, None, None] * (
-        GRID_INTERVAL_S / SECOND_DIFFERENCE_WINDOW_S
+    delay_s = (np.flatnonzero(has_overlap) - (len(has_overlap) - 1) / 2.0) * GRID_INTERVAL_S
+    # Mean products of source axes and NED axes, mean squares of source axes and of NED axes
+    products, source_squares, imu_squares = (
+        _compute_cross_moments(source_values, imu_values)[has_overlap]
+        / common_sample_counts[has_overlap]
+        for source_values, imu_values in (
+            (source, imu_m),
+            (source**2, imu_is_valid),
+            (source_is_valid, imu_m**2),
+        )
     )
-    cross_moments /= cross_moments[:, 6:, 6:]
     # If z is constant, the source measures no height, and z is the vertical axis
     permutations = [
         permutation
         for permutation in SIGNED_AXIS_PERMUTATIONS
-        if permutation.vertical_axis == 2 or source_motion.second_differences[:, 2].any()
+        if permutation.vertical_axis == 2 or source[:, 2].any()
     ]
-    vertical_axis, vertical_sign, first_horizontal_axis, second_horizontal_axis, handedness = (
-        np.transpose(permutations)
+    score, rotation_rad = _compute_log_likelihoods(
+        products, source_squares, imu_squares, permutations
     )
-    # Complex numbers are north + i east
-    horizontal_cross_moments = cross_moments[:, :3, 0] + 1j * cross_moments[:, :3, 1]
-    correlation = (
-        horizontal_cross_moments[:, first_horizontal_axis]
-        - 1j * handedness * horizontal_cross_moments[:, second_horizontal_axis]
-    )
-    source_mean_square = np.maximum(cross_moments[:, 3:6, 6, None], 1e-12)
-    metres_per_unit = np.array([*METRES_PER_UNIT.values()])
-    north_mean_square_m2, east_mean_square_m2, down_mean_square_m2 = np.moveaxis(
-        cross_moments[:, 6, 3:6, None, None], 1, 0
-    )
-    horizontal_residual_m2 = (
-        metres_per_unit**2
-        * (
-            source_mean_square[:, first_horizontal_axis]
-            + source_mean_square[:, second_horizontal_axis]
-        )
-        + north_mean_square_m2
-        + east_mean_square_m2
-        - 2.0 * metres_per_unit * np.abs(correlation)[..., None]
-    ) / 2.0
-    down_residual_m2 = (
-        metres_per_unit**2 * source_mean_square[:, vertical_axis]
-        + down_mean_square_m2
-        - 2.0 * metres_per_unit * (vertical_sign * cross_moments[:, vertical_axis, 2])[..., None]
-    )
-    log_likelihood_per_residual = 0.5 * (
-        np.sum(np.log(source_mean_square), axis=1)[:, None]
-        + 6.0 * np.log(metres_per_unit)
-        - 2.0 * np.log(np.maximum(horizontal_residual_m2, MIN_HORIZONTAL_SIGMA_M**2))
-        - np.log(np.maximum(down_residual_m2, MIN_VERTICAL_SIGMA_M**2))
-    )
-    score = independent_residual_count * log_likelihood_per_residual
-    rotation_rad = np.angle(correlation)
+    # Times the number of independent residuals
+    score *= common_sample_counts[has_overlap] * (GRID_INTERVAL_S / SECOND_DIFFERENCE_WINDOW_S)
     nearest_quarter_turns = np.round(rotation_rad / (np.pi / 2.0)).astype(int) % 4
     hypotheses = []
     for quarter_turns in range(4):
         scores_at_quarter_turn = np.where(
             (nearest_quarter_turns == quarter_turns)[..., None], score, -np.inf
         )
+        # Keep the best time offset of each axis permutation and unit
         for (permutation_index, unit_index), offset_index in np.ndenumerate(
             np.argmax(scores_at_quarter_turn, axis=0)
         ):
@@ -337,6 +316,7 @@ def find_convention_candidates(
                 + axis_permutation.compute_log_prior_odds(quarter_turns)
                 + UNIT_OTHER_THAN_METRES_LOG_PRIOR_ODDS * (unit_name != "m")
             )
+            # No drifts, no accelerometer bias
             parameters = np.array(
                 [delay_s[offset_index], rotation_rad[offset_index, permutation_index], *[0.0] * 5]
             )
@@ -349,6 +329,64 @@ def find_convention_candidates(
         for hypothesis in hypotheses[:MAX_REFINED_HYPOTHESES]
         if hypothesis.score > hypotheses[0].score - MAX_SCORE_DEFICIT_OF_REFINED_HYPOTHESES
     ]
+
+
+def _compute_log_likelihoods(
+    products: Array,
+    source_squares: Array,
+    imu_squares_m2: Array,
+    permutations: list[SignedAxisPermutation],
+) -> ArrayPair:
+    """Compute the log likelihood of each combination with its best rotation, and this rotation.
+
+    The log likelihood is relative to positions that do not depend on the motion.
+
+    Parameters
+    ----------
+    products : ndarray, shape (offsets, 3, 3)
+        Mean products of the source's axes and the axes north, east, down of the IMU.
+    source_squares : ndarray, shape (offsets, 3, 1)
+        Mean squares of the source's axes.
+    imu_squares_m2 : ndarray, shape (offsets, 1, 3)
+        Mean squares of the IMU's axes.
+
+    Returns
+    -------
+    log_likelihood_per_residual : ndarray, shape (offsets, permutations, units)
+    rotation_rad : ndarray, shape (offsets, permutations)
+        Heading of the first horizontal axis with the smallest residuals.
+    """
+    vertical_axis, vertical_sign, first_horizontal_axis, second_horizontal_axis, handedness = (
+        np.transpose(permutations)
+    )
+    metres_per_unit = np.array([*METRES_PER_UNIT.values()])
+    # Complex numbers are north + i east. The phase of the correlation is the rotation
+    horizontal_products = products[..., 0] + 1j * products[..., 1]
+    correlation = (
+        horizontal_products[:, first_horizontal_axis]
+        - 1j * handedness * horizontal_products[:, second_horizontal_axis]
+    )
+    source_squares = np.maximum(source_squares, 1e-12)
+
+    # Mean squares of source minus IMU, with the positions in metres
+    horizontal_mean_square_residual_m2 = (
+        metres_per_unit**2
+        * (source_squares[:, first_horizontal_axis] + source_squares[:, second_horizontal_axis])
+        + imu_squares_m2[..., :2].sum(axis=2, keepdims=True)
+        - 2.0 * metres_per_unit * np.abs(correlation)[..., None]
+    ) / 2.0
+    down_mean_square_residual_m2 = (
+        metres_per_unit**2 * source_squares[:, vertical_axis]
+        + imu_squares_m2[..., 2:]
+        - 2.0 * metres_per_unit * (vertical_sign * products[:, vertical_axis, 2])[..., None]
+    )
+    log_likelihood_per_residual = 0.5 * (
+        np.log(source_squares).sum(axis=1, keepdims=True)
+        + 6.0 * np.log(metres_per_unit)
+        - 2.0 * np.log(np.maximum(horizontal_mean_square_residual_m2, MIN_HORIZONTAL_SIGMA_M**2))
+        - np.log(np.maximum(down_mean_square_residual_m2, MIN_VERTICAL_SIGMA_M**2))
+    )
+    return log_likelihood_per_residual, np.angle(correlation)
 
 
 def refine_hypothesis(
@@ -401,7 +439,7 @@ def _evaluate_hypothesis(
     independent_residual_count = (
         np.count_nonzero(is_used) * row_interval_s / SECOND_DIFFERENCE_WINDOW_S
     )
-    rejected_result = replace(hypothesis, score=-np.inf), np.zeros(len(PARAMETER_PRIOR_PRECISION))
+    rejected_result = replace(hypothesis, score=-np.inf), np.zeros_like(PARAMETER_PRIOR_PRECISION)
     if independent_residual_count * SECOND_DIFFERENCE_WINDOW_S < MIN_OVERLAP_S:
         return rejected_result
     grid_index, time_s = grid_index[is_used], time_s[is_used]
@@ -411,22 +449,21 @@ def _evaluate_hypothesis(
         grid_index
     ] + grid_fraction * imu_motion.table[grid_index + 1]
     unconverted_second_differences = source_motion.second_differences[rows[is_used]]
-    vertical_axis, vertical_sign, first_horizontal_axis, second_horizontal_axis, handedness = (
-        hypothesis.axis_permutation
-    )
+    axis_permutation = hypothesis.axis_permutation
     metres_per_unit = METRES_PER_UNIT[hypothesis.unit]
     complex_rotation = metres_per_unit * np.exp(
         1j * (rotation_rad + heading_drift_rad_s * elapsed_s)
     )
-    complex_second_difference_m = complex_rotation * (
-        unconverted_second_differences[:, first_horizontal_axis]
-        + 1j * handedness * unconverted_second_differences[:, second_horizontal_axis]
+    complex_second_difference_m = complex_rotation * axis_permutation.combine_horizontal_axes(
+        unconverted_second_differences
     )
     source_second_difference_m = np.column_stack(
         [
             complex_second_difference_m.real,
             complex_second_difference_m.imag,
-            metres_per_unit * vertical_sign * unconverted_second_differences[:, vertical_axis],
+            metres_per_unit
+            * axis_permutation.vertical_sign
+            * unconverted_second_differences[:, axis_permutation.vertical_axis],
         ]
     )
     imu_second_difference_m = (
@@ -443,7 +480,7 @@ def _evaluate_hypothesis(
     is_axis_known = unconverted_second_differences.any(axis=0)
     log_likelihood_gain = (
         log_likelihoods[0]
-        + log_likelihoods[1] * is_axis_known[vertical_axis]
+        + log_likelihoods[1] * is_axis_known[axis_permutation.vertical_axis]
         + np.log(metres_per_unit) * np.count_nonzero(is_axis_known)
         - np.sum(log_likelihoods[2:], where=is_axis_known)
     )
@@ -457,13 +494,11 @@ def _evaluate_hypothesis(
     if 0.0 in (source_square_sum, source_imu_product_sum, imu_square_sum):
         return rejected_result
     jacobian = np.zeros((len(grid_index), 3, len(PARAMETER_PRIOR_PRECISION)))
-    jacobian[..., 0] = imu_motion.second_difference_derivative_m_s[grid_index]
-    jacobian[:, 0, 1], jacobian[:, 1, 1] = (
-        -complex_second_difference_m.imag,
-        complex_second_difference_m.real,
-    )
-    jacobian[..., 2] = jacobian[..., 1] * elapsed_s[:, None]
-    jacobian[..., 3] = jacobian[..., 0] * (time_s - mean_time_s)[:, None]
+    jacobian[..., DELAY] = imu_motion.second_difference_derivative_m_s[grid_index]
+    jacobian[:, 0, HEADING] = -complex_second_difference_m.imag
+    jacobian[:, 1, HEADING] = complex_second_difference_m.real
+    jacobian[..., HEADING_DRIFT] = jacobian[..., HEADING] * elapsed_s[:, None]
+    jacobian[..., CLOCK_DRIFT] = jacobian[..., DELAY] * (time_s - mean_time_s)[:, None]
     jacobian[..., 4:] = imu_table_rows[..., 1:]
     uses_gyro_heading = hypothesis.heading_from != "EKF2"
     is_parameter_estimated = np.array(
@@ -478,9 +513,11 @@ def _evaluate_hypothesis(
         weighted_design_columns @ residual.ravel()
         + (PARAMETER_PRIOR_PRECISION * hypothesis.parameters)[is_parameter_estimated]
     )
-    parameter_step = np.zeros(len(PARAMETER_PRIOR_PRECISION))
+    parameter_step = np.zeros_like(PARAMETER_PRIOR_PRECISION)
     parameter_step[is_parameter_estimated] = -np.linalg.solve(normal_matrix, gradient)
-    parameter_step[0] = np.clip(parameter_step[0], -MAX_TIME_OFFSET_STEP_S, MAX_TIME_OFFSET_STEP_S)
+    parameter_step[DELAY] = np.clip(
+        parameter_step[DELAY], -MAX_TIME_OFFSET_STEP_S, MAX_TIME_OFFSET_STEP_S
+    )
     return replace(
         hypothesis,
         score=float(
@@ -497,11 +534,23 @@ def _evaluate_hypothesis(
 def _fit_student_distributions(
     squared_residuals: Array, dimensions: IntArray, min_variances: Array
 ) -> ArrayPair:
-    """Fit Student's t distribution to each row; return mean log likelihoods and variances."""
+    """Fit Student's t distribution to each row; return mean log likelihoods and variances.
+
+    The variances are fitted by expectation maximisation (Liu and Rubin 1995, ML estimation of the t
+    distribution). The log likelihoods lack their constant terms.
+
+    Parameters
+    ----------
+    squared_residuals : ndarray, shape (distributions, n)
+        Squared lengths of the residual vectors.
+    dimensions : ndarray, shape (distributions,)
+        Dimensions (1 or 2) of the residual vectors.
+    """
     medians = np.median(squared_residuals, axis=1)
+    # Medians of χ² with one and with two degrees of freedom: 0.455 and 1.386
     variances = np.maximum(medians / np.where(dimensions == 1, 0.455, 1.386), min_variances)
     degrees_of_freedom = STUDENT_DEGREES_OF_FREEDOM + dimensions
-    for _ in range(5):
+    for _ in range(5):  # the variances change little in later iterations
         denominators = STUDENT_DEGREES_OF_FREEDOM + squared_residuals / variances[:, None]
         weighted_means = np.mean(squared_residuals / denominators, axis=1)
         variances = np.maximum(degrees_of_freedom * weighted_means / dimensions, min_variances)

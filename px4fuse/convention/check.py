@@ -1,5 +1,6 @@
 """Determination of the axes, unit, clock and orientation that a position source uses."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,9 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.convention.axes import (
+    CLOCK_DRIFT,
+    DELAY,
+    HEADING,
     MAX_TIME_OFFSET_S,
     METRES_PER_UNIT,
     SMALL_ROTATION_RAD,
@@ -32,7 +36,7 @@ from px4fuse.convention.motion import (
     integrate_inertial_data,
     replace_heading,
 )
-from px4fuse.convention.orientation import check_orientation
+from px4fuse.convention.orientation import determine_orientation_convention
 from px4fuse.convention.texts import format_axes, format_delay
 from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack
 from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
@@ -56,7 +60,7 @@ MAX_RESIDUAL_TO_NOISE_RATIO = 2.4
 IMU_SECOND_DIFFERENCE_SIGMA_M = 0.05
 # Up to this loss in log-likelihood (nats), EKF2's heading is preferred to the heading of the
 # gyroscopes, because EKF2's heading refers to north
-MAX_LIKELIHOOD_LOSS_WITH_EKF2_HEADING = 20.0
+MAX_LOG_LIKELIHOOD_LOSS_WITH_EKF2_HEADING = 20.0
 # Minimum number of GNSS positions for a fit of the heading of the source's frame
 MIN_GNSS_POSITIONS = 30
 # The heading fitted to GNSS positions is used if the residual is below this fraction of the extent
@@ -68,7 +72,7 @@ MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT = 15.0
 TESTED_CLOCK_DRIFTS = np.linspace(-0.05, 0.05, 21)
 # A low-pass filter of the source replaces the estimated delay if it increases the log-likelihood by
 # more than this value (nats). With simulated delays, the increase is below 3
-MIN_LIKELIHOOD_GAIN_FROM_LOW_PASS = 8.0
+MIN_LOG_LIKELIHOOD_GAIN_FROM_LOW_PASS = 8.0
 # Limits (s) of delays that may be the effect of a low-pass filter
 MIN_LOW_PASS_DELAY_S, MAX_LOW_PASS_DELAY_S = 0.2, 5.0
 # Repeated positions are removed if they are less than this fraction of all positions
@@ -81,7 +85,7 @@ THIRD_DIFFERENCE_VARIANCE = 20.0
 SECOND_DIFFERENCE_VARIANCE = 6.0
 
 
-def check_convention(
+def determine_source_convention(
     flight: Flight, track: PositionTrack, max_time_offset_s: float = MAX_TIME_OFFSET_S
 ) -> Convention | None:
     """Determine axes, unit, clock and orientation of a position source.
@@ -109,31 +113,30 @@ def check_convention(
     hypotheses = _rank_convention_hypotheses(positions, imu_motion_by_heading_source)
     if not hypotheses:
         return None
+    best_hypothesis, *other_hypotheses = hypotheses
     if clock_drift := _estimate_clock_drift(
-        positions, imu_motion_by_heading_source[hypotheses[0].heading_from], hypotheses[0]
+        positions, imu_motion_by_heading_source[best_hypothesis.heading_from], best_hypothesis
     ):
         positions_without_drift = positions.remove_clock_drift(clock_drift)
-        hypotheses_without_drift = _rank_convention_hypotheses(
+        hypotheses = _rank_convention_hypotheses(
             positions_without_drift, imu_motion_by_heading_source
         )
-        if (
-            hypotheses_without_drift
-            and hypotheses_without_drift[0].score
-            > hypotheses[0].score + MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT
-        ):
-            hypotheses, positions = hypotheses_without_drift, positions_without_drift
+        min_score = best_hypothesis.score + MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT
+        if hypotheses and hypotheses[0].score > min_score:
+            best_hypothesis, *other_hypotheses = hypotheses
+            positions = positions_without_drift
         else:
             clock_drift = 0.0
-    hypotheses[0] = _replace_delay_by_low_pass_filter(
-        hypotheses[0], positions, imu_motion_by_heading_source[hypotheses[0].heading_from]
+    best_hypothesis = _replace_delay_by_low_pass_filter(
+        best_hypothesis, positions, imu_motion_by_heading_source[best_hypothesis.heading_from]
     )
     if not is_source_fused(flight):
-        hypotheses[0] = _rotate_to_gnss(hypotheses[0], positions, flight, track)
-    convention = _choose_convention(hypotheses, positions, clock_drift)
+        best_hypothesis = _rotate_to_gnss(best_hypothesis, positions, flight, track)
+    convention = _choose_convention(best_hypothesis, other_hypotheses, positions, clock_drift)
     if track.orientation is None:
         return convention
     orientation = _check_orientation(
-        inertial_data, track, positions, hypotheses[0], convention.verdict
+        inertial_data, track.orientation, positions, best_hypothesis, convention.verdict
     )
     return structs.replace(convention, orientation=orientation)
 
@@ -166,7 +169,7 @@ def _rank_convention_hypotheses(
     for hypothesis in hypotheses:
         if (
             hypothesis.heading_from == "EKF2"
-            and hypothesis.score > hypotheses[0].score - MAX_LIKELIHOOD_LOSS_WITH_EKF2_HEADING
+            and hypothesis.score > hypotheses[0].score - MAX_LOG_LIKELIHOOD_LOSS_WITH_EKF2_HEADING
             and hypothesis.is_similar_to(hypotheses[0], SMALL_ROTATION_RAD)
         ):
             other_hypotheses = [other for other in hypotheses if other is not hypothesis]
@@ -182,15 +185,17 @@ def _replace_delay_by_low_pass_filter(
         return hypothesis
     filtered_motion = filter_imu_motion(imu_motion, hypothesis.delay_s)
     parameters = hypothesis.parameters.copy()
-    parameters[0] = 0.0
+    parameters[DELAY] = 0.0
     low_pass_hypothesis = refine_hypothesis(
         replace(hypothesis, parameters=parameters),
         positions,
         positions.compute_second_differences(filtered_motion),
         filtered_motion,
     )
-    has_gain = low_pass_hypothesis.score > hypothesis.score + MIN_LIKELIHOOD_GAIN_FROM_LOW_PASS
-    return low_pass_hypothesis if has_gain else hypothesis
+    is_low_pass_better = (
+        low_pass_hypothesis.score > hypothesis.score + MIN_LOG_LIKELIHOOD_GAIN_FROM_LOW_PASS
+    )
+    return low_pass_hypothesis if is_low_pass_better else hypothesis
 
 
 def is_source_fused(flight: Flight) -> bool:
@@ -202,7 +207,11 @@ def is_source_fused(flight: Flight) -> bool:
 def _rotate_to_gnss(
     hypothesis: Hypothesis, positions: SentPositions, flight: Flight, track: PositionTrack
 ) -> Hypothesis:
-    """Fit the rotation of the frame to GNSS positions, because EKF2's heading may be wrong."""
+    """Fit the rotation of the frame to GNSS positions, because EKF2's heading may be wrong.
+
+    The fit is GNSS position = c·(source position) + d·(source velocity) + constant, with complex
+    numbers north + i·east. The phase of c is the rotation; d is a remaining delay.
+    """
     gnss_tracks = [other for other in flight.positions if other.origin.is_gnss]
     if not gnss_tracks or track.origin.is_gnss or not hypothesis.has_rotation:
         return hypothesis
@@ -215,13 +224,7 @@ def _rotate_to_gnss(
     if np.count_nonzero(is_between_source_samples) < MIN_GNSS_POSITIONS:
         return hypothesis
     sent_position_m = METRES_PER_UNIT[hypothesis.unit] * positions.position_m
-    axis_permutation = hypothesis.axis_permutation
-    source_position_m = (
-        sent_position_m[:, axis_permutation.first_horizontal_axis]
-        + 1j
-        * axis_permutation.handedness
-        * sent_position_m[:, axis_permutation.second_horizontal_axis]
-    )
+    source_position_m = hypothesis.axis_permutation.combine_horizontal_axes(sent_position_m)
     velocity_m_s = np.interp(time_s, source_time_s, np.gradient(source_position_m, source_time_s))
     columns = np.column_stack([np.interp(time_s, source_time_s, source_position_m), velocity_m_s])[
         is_between_source_samples
@@ -229,33 +232,34 @@ def _rotate_to_gnss(
     columns -= columns.mean(axis=0)
     north_east_m = (gnss_positions.to_numpy() @ [1.0, 1j])[is_between_source_samples]
     north_east_m -= north_east_m.mean()
-    fitted_coefficients, residual_square_sum_m2, *_ = np.linalg.lstsq(columns, north_east_m)
-    if not residual_square_sum_m2 < (MAX_GNSS_RESIDUAL_RATIO * np.linalg.norm(north_east_m)) ** 2:
+    coefficients = np.linalg.lstsq(columns, north_east_m)[0]
+    residual_m = north_east_m - columns @ coefficients
+    if np.linalg.norm(residual_m) >= MAX_GNSS_RESIDUAL_RATIO * np.linalg.norm(north_east_m):
         return hypothesis
     parameters = hypothesis.parameters.copy()
-    parameters[1] = np.angle(fitted_coefficients[0])
+    parameters[HEADING] = np.angle(coefficients[0])
     return replace(hypothesis, parameters=parameters, heading_from="GNSS")
 
 
 def _choose_convention(
-    hypotheses: list[Hypothesis], positions: SentPositions, clock_drift: float
+    best_hypothesis: Hypothesis,
+    other_hypotheses: list[Hypothesis],
+    positions: SentPositions,
+    clock_drift: float,
 ) -> Convention:
-    """Return the first of ``hypotheses`` (best first) as convention, with verdict and alternatives.
-
-    ``rotation_deg`` has the opposite sign of the estimated heading: in a frame that is rotated
-    clockwise, the positions appear rotated counterclockwise. The scale is the regression
-    coefficient of the source's displacements on the displacements of the IMU, because noise of the
-    source does not bias this coefficient.
-    """
-    best_hypothesis = hypotheses[0]
+    """Return the best hypothesis, with its verdict and the likely ones of the others."""
     # Without heights, z up and z down fit equally well
     has_heights = positions.position_m[:, 2].any()
     other_hypotheses = [
         hypothesis
-        for hypothesis in hypotheses
+        for hypothesis in other_hypotheses
         if not hypothesis.is_similar_to(best_hypothesis)
         and (has_heights or hypothesis.axes[:2] != best_hypothesis.axes[:2])
     ]
+    # In a frame that is rotated clockwise, the positions appear rotated counterclockwise
+    rotation_deg = 0.0
+    if best_hypothesis.has_rotation:
+        rotation_deg = -float(np.degrees(best_hypothesis.heading_minus_quarter_turns_rad))
     x, y, z = best_hypothesis.axes
     likely_conventions = [
         _describe_hypothesis(hypothesis)
@@ -270,10 +274,10 @@ def _choose_convention(
         unit=best_hypothesis.unit,
         heading_from=best_hypothesis.heading_from,
         is_mirrored=best_hypothesis.axis_permutation.is_mirrored,
-        rotation_deg=-float(np.degrees(best_hypothesis.heading_minus_quarter_turns_rad))
-        * best_hypothesis.has_rotation,
+        rotation_deg=rotation_deg,
         late_s=best_hypothesis.delay_s,
         clock_drift=clock_drift,
+        # Noise of the source does not bias this bound of the scale
         scale=best_hypothesis.min_source_to_imu_displacement_ratio,
         log_odds=best_hypothesis.score - other_hypotheses[0].score if other_hypotheses else None,
         log_likelihood_gain=best_hypothesis.score,
@@ -290,13 +294,14 @@ def _judge_hypothesis(
     """
     if hypothesis.score < MIN_LOG_LIKELIHOOD_GAIN:
         return "not determinable"
-    min_gain_per_sample = (
+    min_log_likelihood_gain_per_sample = (
         MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE_IF_AMBIGUOUS
         if is_ambiguous
         else MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE
     )
     if (
-        hypothesis.score < min_gain_per_sample * hypothesis.independent_residual_count
+        hypothesis.score
+        < min_log_likelihood_gain_per_sample * hypothesis.independent_residual_count
         or hypothesis.min_source_to_imu_displacement_ratio > MAX_SOURCE_TO_IMU_DISPLACEMENT_RATIO
         or hypothesis.max_source_to_imu_displacement_ratio < MIN_SOURCE_TO_IMU_DISPLACEMENT_RATIO
         or compute_residual_ratio(hypothesis, positions) > MAX_RESIDUAL_TO_NOISE_RATIO
@@ -335,66 +340,68 @@ def compute_residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> 
 def _estimate_clock_drift(
     positions: SentPositions, imu_motion: ImuSecondDifferences, best_hypothesis: Hypothesis
 ) -> float:
-    """Return the rate error (s/s) of the source's clock, or 0 if it is not significant."""
-    initial_clock_drift = 0.0
+    """Return the rate error (s/s) of the source's clock, or 0 if it is not significant.
+
+    A large drift hides the motion: if no hypothesis fits, the best tested drift is removed first.
+    """
+    start_hypothesis, removed_drift = best_hypothesis, 0.0
     if (
         best_hypothesis.score < MIN_LOG_LIKELIHOOD_GAIN
         or compute_residual_ratio(best_hypothesis, positions) > MAX_RESIDUAL_TO_NOISE_RATIO
     ):
-        hypotheses = [
-            (candidates[0], clock_drift)
+        candidates_and_drifts = [
+            (candidate, clock_drift)
             for clock_drift in TESTED_CLOCK_DRIFTS.tolist()
-            if (
-                candidates := find_convention_candidates(
-                    positions.remove_clock_drift(clock_drift).compute_second_differences(
-                        imu_motion
-                    ),
-                    imu_motion,
-                )
+            for candidate in find_convention_candidates(
+                positions.remove_clock_drift(clock_drift).compute_second_differences(imu_motion),
+                imu_motion,
             )
         ]
-        best_candidate, initial_clock_drift = max(hypotheses, key=lambda pair: pair[0].score)
-        best_hypothesis = replace(best_candidate, heading_from=best_hypothesis.heading_from)
-        positions = positions.remove_clock_drift(initial_clock_drift)
+        best_candidate, removed_drift = max(candidates_and_drifts, key=lambda pair: pair[0].score)
+        start_hypothesis = replace(best_candidate, heading_from=best_hypothesis.heading_from)
+        positions = positions.remove_clock_drift(removed_drift)
     hypothesis = refine_hypothesis(
-        replace(best_hypothesis, has_clock_drift=True),
+        replace(start_hypothesis, has_clock_drift=True),
         positions,
         positions.compute_second_differences(imu_motion),
         imu_motion,
     )
-    clock_drift = (1.0 + initial_clock_drift) / (1.0 - float(hypothesis.parameters[3])) - 1.0
-    return (
-        clock_drift
-        if initial_clock_drift
-        or hypothesis.score > best_hypothesis.score + MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT
-        else 0.0
-    )
+    # determine_source_convention tests a removed drift again, with all hypotheses
+    if (
+        not removed_drift
+        and hypothesis.score <= start_hypothesis.score + MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT
+    ):
+        return 0.0
+    # Combine the clock rates: 1 + removed drift, and 1 - drift that is left (_evaluate_hypothesis)
+    return (1.0 + removed_drift) / (1.0 - float(hypothesis.parameters[CLOCK_DRIFT])) - 1.0
 
 
 def _check_orientation(
     inertial_data: InertialData,
-    track: PositionTrack,
+    sent_orientation: pd.DataFrame,
     positions: SentPositions,
     best_hypothesis: Hypothesis,
     verdict: ConventionVerdict,
 ) -> OrientationConvention | None:
     """Return the convention of the source's orientation, and the heading error if determinable."""
-    assert track.orientation is not None
-    orientation_check_result = check_orientation(
+    orientation_check_result = determine_orientation_convention(
         inertial_data,
-        track.orientation.index.to_numpy(),
-        track.orientation[Columns.QUATERNION].to_numpy(),
+        sent_orientation.index.to_numpy(),
+        sent_orientation[Columns.QUATERNION].to_numpy(),
     )
     if orientation_check_result is None:
         return None
     convention, time_s, attitude = orientation_check_result
+    axis_permutation = best_hypothesis.axis_permutation
     if (
         verdict != "determined"
         or convention.verdict not in ("determined", "ambiguous")
-        or best_hypothesis.axis_permutation.vertical_axis != 2
-        or best_hypothesis.axis_permutation.is_mirrored
+        or axis_permutation.vertical_axis != 2
+        or axis_permutation.is_mirrored
     ):
         return convention
+    # Integrate the IMU with the heading of the source's orientation. The heading of the positions
+    # relative to this motion is the heading error
     source_heading_rad = np.interp(inertial_data.time_s, time_s, heading(attitude))
     imu_motion = integrate_imu_motion(
         inertial_data, replace_heading(inertial_data.gyro_attitude, source_heading_rad)
@@ -404,21 +411,21 @@ def _check_orientation(
     )
     imu_motion = replace(imu_motion, is_valid=imu_motion.is_valid & is_covered)
     # Headings (°) of the x axis of the positions if the source's orientation has no heading error
-    expected_x_axis_headings_deg = {"FLU to ENU": [90.0], "FLU to NWU": [0.0]}.get(
-        convention.frames, [0.0, 90.0]
-    )
-    if best_hypothesis.axis_permutation.vertical_sign > 0:
+    if axis_permutation.vertical_sign > 0 or convention.frames == "FLU to NWU":
         expected_x_axis_headings_deg = [0.0]
-    axes_and_unit = best_hypothesis.axis_permutation, best_hypothesis.unit
+    elif convention.frames == "FLU to ENU":
+        expected_x_axis_headings_deg = [90.0]
+    else:  # z points up: NWU or ENU
+        expected_x_axis_headings_deg = [0.0, 90.0]
     for hypothesis in search_hypotheses(positions, {"EKF2": imu_motion}):
-        if hypothesis.has_rotation and axes_and_unit == (
-            hypothesis.axis_permutation,
-            hypothesis.unit,
+        if (
+            hypothesis.has_rotation
+            and hypothesis.axis_permutation == axis_permutation
+            and hypothesis.unit == best_hypothesis.unit
         ):
-            x_heading_deg = float(np.degrees(hypothesis.parameters[1]))
             heading_errors_deg = (
-                (x_heading_deg - expected_x_axis_heading_deg + 180.0) % 360.0 - 180.0
-                for expected_x_axis_heading_deg in expected_x_axis_headings_deg
+                math.remainder(np.degrees(hypothesis.parameters[HEADING]) - expected_deg, 360.0)
+                for expected_deg in expected_x_axis_headings_deg
             )
             return structs.replace(convention, heading_error_deg=min(heading_errors_deg, key=abs))
     return convention

@@ -1,5 +1,6 @@
 """Deviations of a source from PX4's convention (axes, unit, clock), and their correction."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -90,13 +91,11 @@ def find_convention_faults(
         return ConventionFaults()
     orientation_fault = _find_orientation_fault(convention)
     if convention.verdict == "ambiguous":
-        likely_conventions = (
-            format_axes(convention.axes, convention.unit),
-            *convention.alternatives,
-        )
+        best_convention = format_axes(convention.axes, convention.unit)
+        # NED in metres, with any rotation and delay
         is_ned_likely = any(
             convention_text.startswith(format_axes(FRAME_AXES["NED"], "m"))
-            for convention_text in likely_conventions
+            for convention_text in (best_convention, *convention.alternatives)
         )
         return ConventionFaults(orientation=orientation_fault, is_ambiguous=not is_ned_likely)
     if convention.verdict != "determined":
@@ -105,7 +104,7 @@ def find_convention_faults(
     has_wrong_axes, rotation_deg = _find_axis_fault_and_rotation(convention)
     has_wrong_heading = orientation_fault in ("order", "heading")
     uses_gyro_heading = convention.heading_from == "gyroscopes"
-    # EKF2 fused the yaw of the source, so the log contains no independent heading
+    # EKF2 fused the yaw of the source, so EKF2's heading is no reference for the positions
     is_heading_from_source = (
         is_fused
         and uses_gyro_heading
@@ -113,6 +112,7 @@ def find_convention_faults(
         and orientation_fault != "copied"
     )
     has_no_heading_reference = uses_gyro_heading and not is_fused and not has_wrong_axes
+    # With a wrong heading of the source, the orientation is the fault. FRD has no fixed rotation
     if has_wrong_heading or is_heading_from_source or has_no_heading_reference or frame == "FRD":
         rotation_deg = 0.0
     faults = ConventionFaults(
@@ -134,12 +134,16 @@ def _find_axis_fault_and_rotation(convention: Convention) -> tuple[bool, float]:
     rotation_deg, is_z_up = convention.rotation_deg, convention.z == "up"
     is_enu_or_nwu = convention.axes in (FRAME_AXES["ENU"], FRAME_AXES["NWU"])
     if convention.is_mirrored or is_enu_or_nwu or convention.z not in ("up", "down"):
-        return True, rotation_deg * (abs(rotation_deg) > MIN_RESIDUAL_ROTATION_DEG)
-    total_rotation_deg = (
-        rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x) + 90.0 * is_z_up
-    )
-    total_rotation_deg = (total_rotation_deg + 180.0) % 360.0 - 180.0
-    return is_z_up, total_rotation_deg * (abs(total_rotation_deg) > MIN_FRAME_ROTATION_DEG)
+        return True, rotation_deg if abs(rotation_deg) > MIN_RESIDUAL_ROTATION_DEG else 0.0
+    # The x axis points north in NED, and east in ENU (z up)
+    total_rotation_deg = _compute_angle_from_x_to_north_deg(convention) + 90.0 * is_z_up
+    total_rotation_deg = math.remainder(total_rotation_deg, 360.0)
+    return is_z_up, total_rotation_deg if abs(total_rotation_deg) > MIN_FRAME_ROTATION_DEG else 0.0
+
+
+def _compute_angle_from_x_to_north_deg(convention: Convention) -> float:
+    """Return the clockwise angle (°) from the x axis of the positions to north."""
+    return convention.rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x)
 
 
 def _find_orientation_fault(convention: Convention) -> OrientationFault:
@@ -175,10 +179,11 @@ def convert_to_px4_convention(
         _correct_times(samples.index, faults),
         Columns.POSITION + Columns.POSITION_VARIANCE,
     )
+    # The kind VIO was inferred from the orientation, which is not a measurement
     if faults.orientation == "copied" and origin.kind == "vio":
         origin = structs.replace(origin, kind=infer_position_kind(samples))
     if faults.orientation in ("copied", "heading"):
-        orientation = None
+        orientation = None  # it cannot be corrected
     elif orientation is not None and convention.orientation is not None:
         quaternion = orientation[Columns.QUATERNION].to_numpy()
         orientation = orientation.set_axis(_correct_times(orientation.index, faults))
@@ -190,20 +195,17 @@ def convert_to_px4_convention(
 def _replace_attitude(flight: Flight, convention: Convention, faults: ConventionFaults) -> Flight:
     """Replace EKF2's attitude by the attitude from the gyroscopes, if EKF2 fused wrong positions.
 
-    The heading of the new attitude must fit the frame of the positions. If the position axes are
-    not corrected, their x axis is used as north. The attitude is then rotated by the detected angle
-    between its north and the x axis.
+    The heading of the new attitude must fit the frame of the positions. If
+    :func:`convert_to_px4_convention` does not correct their axes, their x axis is used as north:
+    the attitude is then rotated by the detected angle from the x axis to north.
     """
     inertial_data = integrate_inertial_data(flight) if faults.affects_ekf2 else None
     if inertial_data is None:
         return flight
     attitude = inertial_data.compute_attitudes()[convention.heading_from]
     if not faults.has_wrong_axes and not faults.rotation_deg:
-        # CLOCKWISE_DIRECTIONS are 90° from each other
-        heading_change_deg = convention.rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(
-            convention.x
-        )
-        attitude = replace_heading(attitude, heading(attitude) + np.radians(heading_change_deg))
+        heading_change_rad = np.radians(_compute_angle_from_x_to_north_deg(convention))
+        attitude = replace_heading(attitude, heading(attitude) + heading_change_rad)
     attitude_table = pd.DataFrame(attitude, time_index(inertial_data.time_s), Columns.QUATERNION)
     return replace(flight, attitude=attitude_table)
 

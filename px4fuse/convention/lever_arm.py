@@ -14,17 +14,17 @@ from px4fuse.convention.motion import (
 from px4fuse.core.arrays import Array
 from px4fuse.filter.signals import interpolate_attitude
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Truth, Unavailable
-from px4fuse.trajectory.rotation import to_matrix
+from px4fuse.trajectory.rotation import to_rotation_matrix
 from px4fuse.trajectory.scores import compute_autocorrelation_time
 
 # Minimum lever arm (m) that is reported: twice the noise of good UWB (0.1 m)
-MIN_LEVER_ARM_M = 0.2
+MIN_REPORTED_LEVER_ARM_M = 0.2
 # Minimum ratio of a reported lever arm to its σ: noise reaches 1.5
 MIN_LEVER_ARM_SIGMAS = 2.5
 MIN_LEVER_ARM_WITH_TRUTH_M = 0.05
 MIN_LEVER_ARM_SIGMAS_WITH_TRUTH = 5.0
 # Maximum reported lever arm (m): larger values are frame errors of the position source
-MAX_LEVER_ARM_M = 5.0
+MAX_REPORTED_LEVER_ARM_M = 5.0
 # Maximum residual (σ) of a sample in the next fit
 MAX_RESIDUAL_SIGMAS = 3.0
 # Minimum ratio of singular values in the lever arm fit with ground truth
@@ -89,31 +89,34 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
             for name in columns
         ]
     )
-    # Fit a delay and a rotation too, because they resemble a lever arm
     velocity_m_s = np.gradient(true_positions_m, time_s, axis=0)
     error_per_radian_m = _rotate(true_positions_m - np.nanmean(true_positions_m, axis=0), 90.0)
-    rms_distance_from_path_mean_m = max(
-        float(np.sqrt(np.nanmean(error_per_radian_m**2))), MIN_RMS_DISTANCE_FROM_PATH_MEAN_M
-    )
-    error_per_radian_m /= rms_distance_from_path_mean_m
-    rotation = to_matrix(interpolate_attitude(attitude, time_s))[:, :2, :2]
-    offset_columns = np.broadcast_to(np.eye(2), rotation.shape)
+    # Columns: lever arm (forward, right), offset (north, east), delay and rotation. Delay and
+    # rotation are fitted because they resemble a lever arm
+    attitude_columns = to_rotation_matrix(interpolate_attitude(attitude, time_s))[:, :2, :2]
+    offset_columns = np.broadcast_to(np.eye(2), attitude_columns.shape)
     motion_columns = np.stack([velocity_m_s, error_per_radian_m], axis=2)
-    design = np.concatenate([rotation, offset_columns, motion_columns], axis=2)
+    design = np.concatenate([attitude_columns, offset_columns, motion_columns], axis=2)
     is_known = np.isfinite(velocity_m_s).all(axis=1)
     design_rows = design[is_known].reshape(-1, 6)
     if len(design_rows) < MIN_COORDINATE_COUNT:
         return None
+    # The rank test needs columns of equal size: divide the rotation column by its RMS
+    column_scales = np.ones(6)
+    column_scales[-1] = max(
+        np.sqrt(np.nanmean(error_per_radian_m**2)), MIN_RMS_DISTANCE_FROM_PATH_MEAN_M
+    )
     rotation_deg = 0.0
-    for _ in range(LEVER_ARM_FIT_COUNT):
+    for _ in range(LEVER_ARM_FIT_COUNT):  # a large rotation is not linear: fit the rest again
         error_m = _rotate(position_samples.to_numpy(), -rotation_deg) - true_positions_m
         valid_position_errors_m = error_m[is_known].ravel()
-        fitted_parameters, _, rank, _ = np.linalg.lstsq(
-            design_rows, valid_position_errors_m, rcond=MIN_SINGULAR_VALUE_RATIO
+        scaled_parameters, _, rank, _ = np.linalg.lstsq(
+            design_rows / column_scales, valid_position_errors_m, rcond=MIN_SINGULAR_VALUE_RATIO
         )
-        if rank < design_rows.shape[1]:  # with a constant heading, a lever arm is an offset
+        if rank < len(column_scales):  # with a constant heading, a lever arm is an offset
             return None
-        rotation_deg += float(np.degrees(fitted_parameters[5])) / rms_distance_from_path_mean_m
+        fitted_parameters = scaled_parameters / column_scales
+        rotation_deg += float(np.degrees(fitted_parameters[-1]))
     residual_m = (valid_position_errors_m - design_rows @ fitted_parameters).reshape(-1, 2)
     # Successive errors of a source may be correlated
     variance_factor = max(map(compute_autocorrelation_time, residual_m.T))
@@ -121,13 +124,14 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
         np.linalg.inv(design_rows.T @ design_rows) * np.mean(residual_m**2) * variance_factor
     )
     lever_arm = _make_lever_arm(fitted_parameters, covariance, rotation_deg)
-    lever_arm = lever_arm._replace(
-        rotation_sigma_deg=lever_arm.rotation_sigma_deg / rms_distance_from_path_mean_m
-    )
     min_length_m = max(
         MIN_LEVER_ARM_WITH_TRUTH_M, MIN_LEVER_ARM_SIGMAS_WITH_TRUTH * lever_arm.sigma_m
     )
-    return lever_arm if min_length_m < lever_arm.horizontal_length_m < MAX_LEVER_ARM_M else None
+    return (
+        lever_arm
+        if min_length_m < lever_arm.horizontal_length_m < MAX_REPORTED_LEVER_ARM_M
+        else None
+    )
 
 
 def _make_lever_arm(parameters: Array, covariance: Array, rotation_deg: float) -> LeverArm:
@@ -149,22 +153,31 @@ def _rotate(vectors: Array, angle_deg: float) -> Array:
 
 
 def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
+    """Fit the second differences of the positions to those of the IMU, with a lever arm.
+
+    Delay, accelerometer bias and rotation are fitted too. Each iteration corrects delay and
+    rotation, and removes outliers.
+    """
     inertial_data = integrate_inertial_data(flight)
     position_samples = track.samples[Columns.POSITION[:2]].dropna()
     if inertial_data is None or len(position_samples) < 2:
         return None
     attitude = inertial_data.compute_attitudes()["EKF2"]
     imu_motion = integrate_imu_motion(inertial_data, attitude)
-    rotation = to_matrix(attitude)[:, :2, :2].reshape(-1, 4)
+    rotation = to_rotation_matrix(attitude)[:, :2, :2].reshape(-1, 4)
     rotation_second_differences = SourceSecondDifferences.from_positions(
         inertial_data.time_s, rotation, imu_motion.time_s
     ).second_differences.reshape(-1, 2, 2)
-    motion_columns = [
-        imu_motion.second_difference_derivative_m_s[:, :2, None],
-        imu_motion.table[:, :2, 1:],
-        _rotate(imu_motion.table[:, :2, 0], 90.0)[:, :, None],
-    ]
-    design = np.concatenate([rotation_second_differences, *motion_columns], axis=2)
+    horizontal_imu_m = imu_motion.table[:, :2, 0]
+    design = np.concatenate(
+        [
+            rotation_second_differences,  # lever arm forward, right
+            imu_motion.second_difference_derivative_m_s[:, :2, None],  # time shift
+            imu_motion.table[:, :2, 1:],  # accelerometer bias forward, right, down
+            _rotate(horizontal_imu_m, 90.0)[:, :, None],  # rotation
+        ],
+        axis=2,
+    )
     time_s, is_used = position_samples.index.to_numpy(), imu_motion.is_valid
     rotation_deg = 0.0
     for _ in range(LEVER_ARM_FIT_COUNT):
@@ -172,7 +185,7 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
             time_s, _rotate(position_samples.to_numpy(), -rotation_deg), imu_motion.time_s
         )
         is_used = is_used & source_motion.is_valid
-        second_difference_error_m = source_motion.second_differences - imu_motion.table[:, :2, 0]
+        second_difference_error_m = source_motion.second_differences - horizontal_imu_m
         design_rows = design[is_used].reshape(-1, design.shape[2])
         valid_second_difference_errors_m = second_difference_error_m[is_used].ravel()
         # Second differences with common positions are not independent
@@ -197,11 +210,11 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
             / independent_difference_count
         )
         is_used &= residual_m < MAX_RESIDUAL_SIGMAS * sigma_m
-        # The third parameter is the time (s) by which the timestamps are early
+        # Parameter 2: time (s) by which the timestamps are early
         time_s = time_s + fitted_parameters[2]
         rotation_deg += float(np.degrees(fitted_parameters[-1]))
     # The fit is relative to the IMU, the parameters are relative to the vehicle's origin
     fitted_parameters[:2] += find_imu_position_m(flight)[:2]
     lever_arm = _make_lever_arm(fitted_parameters, covariance, rotation_deg)
-    min_length_m = max(MIN_LEVER_ARM_M, MIN_LEVER_ARM_SIGMAS * lever_arm.sigma_m)
+    min_length_m = max(MIN_REPORTED_LEVER_ARM_M, MIN_LEVER_ARM_SIGMAS * lever_arm.sigma_m)
     return lever_arm if lever_arm.horizontal_length_m > min_length_m else None

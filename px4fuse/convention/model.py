@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from px4fuse.core.record import NotNegative, PositiveFloat, Record
+from px4fuse.core.record import NonNegativeFloat, PositiveFloat, Record
 
 ConventionVerdict = Literal["determined", "ambiguous", "doubtful", "not determinable"]
 Direction = Literal["north", "east", "south", "west", "up", "down"]
@@ -35,7 +35,7 @@ class OrientationConvention(Record, kw_only=True, omit_defaults=False):
     order: QuaternionOrder = "w x y z"
     frames: BodyAndWorldFrame = "FRD to NED"
     heading_error_deg: float | None = None
-    tilt_difference_deg: NotNegative = 0.0
+    tilt_difference_deg: NonNegativeFloat = 0.0
 
 
 class Convention(Record, kw_only=True, omit_defaults=False):

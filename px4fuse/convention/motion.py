@@ -24,7 +24,7 @@ from px4fuse.core.arrays import (
     interpolate_columns,
 )
 from px4fuse.ekf2.replay import is_inside_spans
-from px4fuse.filter.signals import find_imu_gaps, interpolate_attitude
+from px4fuse.filter.signals import Segment, find_imu_gaps, interpolate_attitude
 from px4fuse.flight.model import Columns, Flight, Spans, Unavailable
 from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
 from px4fuse.trajectory.rotation import (
@@ -34,7 +34,7 @@ from px4fuse.trajectory.rotation import (
     heading,
     multiply,
     rotate,
-    to_matrix,
+    to_rotation_matrix,
     to_rotation_vector,
 )
 
@@ -169,20 +169,19 @@ def integrate_inertial_data(flight: Flight) -> InertialData | None:
     if isinstance(airborne_spans_s, Unavailable):
         airborne_spans_s = ((time_s[0], time_s[-1]),)
     gap_rows = np.flatnonzero(find_imu_gaps(imu_times_s))
-    gap_free_spans_s = zip(
-        [-np.inf, *imu_times_s[gap_rows + 1]], [*imu_times_s[gap_rows], np.inf], strict=True
-    )
-    valid_spans_s = (
-        (max(flight_start_s, recorded_from_s), min(flight_end_s, recorded_until_s))
-        for recorded_from_s, recorded_until_s in gap_free_spans_s
-        for flight_start_s, flight_end_s in airborne_spans_s
-    )
+    gap_free_spans_s = [
+        *zip([-np.inf, *imu_times_s[gap_rows + 1]], [*imu_times_s[gap_rows], np.inf], strict=True)
+    ]
     return InertialData(
         time_s,
         specific_force_m_s2,
         logged_attitude,
         gyro_attitude,
-        tuple(span for span in valid_spans_s if span[0] < span[1]),
+        tuple(
+            valid_span_s
+            for start_s, end_s in airborne_spans_s
+            for valid_span_s in Segment(start_s, end_s, "").clip_spans(gap_free_spans_s)
+        ),
     )
 
 
@@ -210,7 +209,7 @@ def _integrate_gyros(rotation_rad: Array, logged_attitude: Array) -> Array:
 
 def _level_attitude(attitude: Array, specific_force_m_s2: Array) -> Array:
     """Correct the tilt of an attitude, so that the mean specific force is vertical."""
-    mean_specific_force_m_s2 = rotate(to_matrix(attitude[:-1]), specific_force_m_s2)
+    mean_specific_force_m_s2 = rotate(to_rotation_matrix(attitude[:-1]), specific_force_m_s2)
     for _ in range(2):
         mean_specific_force_m_s2 = running_mean(
             mean_specific_force_m_s2,
@@ -237,11 +236,11 @@ def running_mean(values: Array, is_valid: BoolArray, width: int) -> Array:
 
 
 def high_pass(values: Array, is_valid: BoolArray) -> Array:
-    high_pass_filtered = values - running_mean(
+    high_pass_filtered_values = values - running_mean(
         values, is_valid, round(HIGH_PASS_WINDOW_S / GRID_INTERVAL_S)
     )
-    high_pass_filtered[~is_valid] = 0.0
-    return high_pass_filtered
+    high_pass_filtered_values[~is_valid] = 0.0
+    return high_pass_filtered_values
 
 
 def compute_second_differences(position: Array, window: int) -> Array:
@@ -254,7 +253,7 @@ def integrate_imu_motion(inertial_data: InertialData, attitude: Array) -> ImuSec
     ``attitude``, shape (n + 1, 4), is a quaternion (w, x, y, z; FRD to NED).
     """
     quaternion_sums = attitude[1:] + attitude[:-1]
-    body_to_ned = to_matrix(
+    body_to_ned = to_rotation_matrix(
         quaternion_sums / np.linalg.norm(quaternion_sums, axis=1, keepdims=True)
     )
     acceleration = body_to_ned @ inertial_data.specific_force_m_s2[..., None] + [
@@ -262,9 +261,12 @@ def integrate_imu_motion(inertial_data: InertialData, attitude: Array) -> ImuSec
         [0.0],
         [constants.g],
     ]
+    # Four columns: acceleration, and its derivatives with respect to the accelerometer bias (FRD).
+    # All four are integrated twice
     table = np.concatenate([acceleration, body_to_ned], axis=2)
     position_m = np.zeros((len(attitude), 3, 4))
-    # Trapezoidal rule, in place to limit memory
+    # The displacement in step k is (a_0 + … + a_k - a_k/2)·Δt² with the mean acceleration a_k of
+    # each step, from rest. The arrays are changed in place to limit memory
     displacement_m = np.cumsum(table, axis=0)
     table /= 2.0
     displacement_m -= table

@@ -3,6 +3,7 @@
 Each possible convention is compared with the attitude from the gyroscopes.
 """
 
+import math
 from itertools import product
 from typing import Final, NamedTuple
 
@@ -18,7 +19,7 @@ from px4fuse.trajectory.rotation import (
     heading,
     interpolate,
     multiply,
-    to_matrix,
+    to_rotation_matrix,
 )
 
 IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
@@ -74,7 +75,7 @@ class OrientationCandidate(NamedTuple):
         return self.convention.order, self.convention.frames.replace("ENU", "NWU")
 
 
-def check_orientation(
+def determine_orientation_convention(
     inertial_data: InertialData, time_s: Array, quaternion: Array
 ) -> tuple[OrientationConvention, Array, Array] | None:
     """Determine the quaternion order and frames of a source's orientation.
@@ -93,19 +94,16 @@ def check_orientation(
     flight_rows = np.flatnonzero(is_inside_spans(time_s, inertial_data.valid_spans_s))
     if len(flight_rows) < MIN_ORIENTATION_COUNT:
         return None
-    flight_rows = flight_rows[:: -(-len(flight_rows) // MAX_ORIENTATION_COUNT)]
+    flight_rows = flight_rows[:: math.ceil(len(flight_rows) / MAX_ORIENTATION_COUNT)]
     sample_times_s, sent_quaternions = time_s[flight_rows], quaternion[flight_rows]
     sent_quaternions = sent_quaternions / np.linalg.norm(sent_quaternions, axis=1, keepdims=True)
     for delay_s in COPY_DELAYS_S:
         logged_attitude = interpolate(
             sample_times_s - delay_s, inertial_data.time_s, inertial_data.logged_attitude
         )
-        cos_half_angle = np.clip(
-            np.abs(np.sum(sent_quaternions * logged_attitude, axis=1)), 0.0, 1.0
-        )
-        if np.median(2.0 * np.arccos(cos_half_angle)) < np.radians(
-            MAX_DIFFERENCE_OF_ATTITUDE_COPY_DEG
-        ):
+        # |q1 · q2| is the cosine of half the angle between two attitudes
+        half_angle_cosine = np.median(np.abs(np.sum(sent_quaternions * logged_attitude, axis=1)))
+        if half_angle_cosine > np.cos(np.radians(MAX_DIFFERENCE_OF_ATTITUDE_COPY_DEG) / 2.0):
             return OrientationConvention(verdict="copied"), sample_times_s, sent_quaternions
     reference_attitude = interpolate(
         sample_times_s, inertial_data.time_s, inertial_data.gyro_attitude
@@ -120,6 +118,7 @@ def check_orientation(
     ]
     candidates.sort(key=lambda candidate: -candidate.score)
     best_candidate = candidates[0]
+    # Conventions that differ only in heading do not compete
     second_best_candidate = next(
         candidate
         for candidate in candidates
@@ -159,7 +158,9 @@ def _score_convention(
 ) -> OrientationCandidate:
     """Score one convention of the quaternions by their distance from the reference attitude.
 
-    The score decreases with the median differences of tilt and heading.
+    The score is a log likelihood plus log prior odds (nats). Orientation errors are correlated, so
+    the number of independent samples is proportional to the duration. A constant heading difference
+    is allowed: the positions determine the heading error.
     """
     convention = OrientationConvention(verdict="determined", order=order, frames=frames)
     body_rotation = from_rotation_vector(np.array([0.0, 0.0, body_quarter_turns * np.pi / 2.0]))
@@ -169,8 +170,10 @@ def _score_convention(
     heading_difference_rad = np.abs(
         np.angle(heading_difference_phasor * np.exp(-1j * mean_heading_difference_rad))
     )
-    tilt_cosine = np.sum(to_matrix(attitude)[:, 2] * to_matrix(reference_attitude)[:, 2], axis=1)
-    tilt_difference_rad = np.arccos(np.clip(tilt_cosine, -1.0, 1.0))
+    tilt_difference_cosine = np.sum(
+        to_rotation_matrix(attitude)[:, 2] * to_rotation_matrix(reference_attitude)[:, 2], axis=1
+    )
+    tilt_difference_rad = np.arccos(np.clip(tilt_difference_cosine, -1.0, 1.0))
     tilt_difference_deg, heading_difference_deg = np.degrees(
         np.median([tilt_difference_rad, heading_difference_rad], axis=1)
     ).tolist()
@@ -180,9 +183,14 @@ def _score_convention(
     score = (
         -ANGLE_DIFFERENCE_WEIGHT_PER_S * (time_s[-1] - time_s[0]) * np.sum(log_angle_differences)
     )
-    score -= 4.0 * (order != "w x y z") + 2.0 * (frames != "FRD to NED")
-    score -= 2.0 * (body_quarter_turns != 0) + 1.0 * (
-        abs(mean_heading_difference_rad) > np.radians(8.0)
-    )
+    # Log prior odds: PX4's convention, and a sensor without rotation, are more probable
+    if order != "w x y z":
+        score -= 4.0
+    if frames != "FRD to NED":
+        score -= 2.0
+    if body_quarter_turns:
+        score -= 2.0
+    if abs(mean_heading_difference_rad) > np.radians(8.0):
+        score -= 1.0
     convention = replace(convention, tilt_difference_deg=tilt_difference_deg)
     return OrientationCandidate(convention, heading_difference_deg, score)

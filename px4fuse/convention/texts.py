@@ -91,12 +91,12 @@ def describe_axes(
     return fault, f"Send {ned_text}."
 
 
-def describe_unit(
+def describe_wrong_unit(
     unit: Unit, positions: str, stated_unit: str = "metres", *, is_file: bool
 ) -> tuple[str, str]:
     """Describe a wrong length unit of a position source or file, and the action.
 
-    >>> describe_unit("cm", "positions", is_file=True)
+    >>> describe_wrong_unit("cm", "positions", is_file=True)
     ('positions are in centimetres, not in metres', 'Run again with --position-unit cm.')
     """
     fault = f"{positions} are in {UNIT_NAMES[unit]}, not in {stated_unit}"

@@ -22,26 +22,19 @@ _input_path_by_file_id: ContextVar[dict[_FileIdentity | None, Path] | None] = Co
 
 
 @contextmanager
-def protect_inputs() -> Iterator[None]:
-    """Register all files that are read in this context, so that no output overwrites them."""
-    context_token = _input_path_by_file_id.set({})
+def protect_inputs(*, is_active: bool = True) -> Iterator[None]:
+    """Register all files that are read in this context, so that no output overwrites them.
+
+    If ``is_active`` is False, outputs may overwrite files that are read in this context.
+    """
+    context_token = _input_path_by_file_id.set({} if is_active else None)
     try:
         yield
     finally:
         _input_path_by_file_id.reset(context_token)
 
 
-@contextmanager
-def suspend_input_registration() -> Iterator[None]:
-    """Allow outputs to overwrite files that are read in this context."""
-    context_token = _input_path_by_file_id.set(None)
-    try:
-        yield
-    finally:
-        _input_path_by_file_id.reset(context_token)
-
-
-def add_input(path: Path) -> None:
+def register_input_path(path: Path) -> None:
     """Register an input file or folder, so that no output overwrites it."""
     input_path_by_file_id = _input_path_by_file_id.get()
     if input_path_by_file_id is not None and (identity := _read_file_identity(path)) is not None:
@@ -60,19 +53,19 @@ def check_outputs(output_paths: Iterable[Path]) -> None:
 
 
 def check_output_folder(folder: Path) -> None:
-    """Raise an OutputError if the output folder is a file, or contains an input file."""
+    """Raise an OutputError if the output folder is a file, or contains an input file.
+
+    Links in the folder and its subfolders may also lead to an input, or to a folder with an input.
+    """
     if folder.exists() and not folder.is_dir():
         raise OutputError(
             f"{folder} is a file, but the output needs a folder. Choose another name."
         )
-    input_path_by_file_id = {**(_input_path_by_file_id.get() or {})}
-    input_by_folder = {
-        input_folder: path
-        for path in input_path_by_file_id.values()
-        for input_folder in (*path.absolute().parents, *path.resolve().parents)
-    }
-    input_path_by_file_id |= {
-        _read_file_identity(key): path for key, path in input_by_folder.items()
+    input_path_by_file_id = {
+        _read_file_identity(protected_path): path
+        for path in (_input_path_by_file_id.get() or {}).values()
+        # The parents of a link, and the parents of the file to which it leads
+        for protected_path in (path, *path.absolute().parents, *path.resolve().parents)
     }
     input_path_by_file_id.pop(None, None)  # None is the key of folders that no longer exist
     entries = _list_folder(folder)

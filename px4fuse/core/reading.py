@@ -15,7 +15,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
-from px4fuse.core.input_files import add_input
+from px4fuse.core.input_files import register_input_path
 from px4fuse.errors import LogError, Px4FuseError, suggest_name, to_one_line
 
 if sys.version_info >= (3, 14):
@@ -27,6 +27,8 @@ else:
 max_log_bytes: ContextVar[int] = ContextVar("max_log_bytes", default=2_000_000_000)
 #: Folders that ``px4fuse mcp`` may read (option ``--root``); all folders if empty
 readable_folders: ContextVar[tuple[Path, ...]] = ContextVar("readable_folders", default=())
+# Byte order marks of UTF-16, the encoding of texts from Windows shells
+UTF_16_BYTE_ORDER_MARKS = (b"\xff\xfe", b"\xfe\xff")
 LOG_SIZE_REMEDY = (
     "Cut the log to the time span of the flight, or increase the size limit with --max-size MB."
 )
@@ -56,14 +58,14 @@ def check_readable(path: Path, folders: Sequence[Path]) -> None:
     """
     resolved_path = Path(os.path.realpath(path))
     if folders and not any(map(resolved_path.is_relative_to, folders)):
-        folder_names = " or ".join(map(str, folders))
+        folder_names_text = " or ".join(map(str, folders))
         raise LogError(
             f"{display_name(path)} is outside the folders that --root allows",
-            f"Copy the file to {folder_names}.",
+            f"Copy the file to {folder_names_text}.",
         )
 
 
-def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int:
+def get_file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int:
     """Return the size (bytes) of a regular file, and register the file as an input.
 
     Raises
@@ -88,13 +90,13 @@ def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int
         raise error_type(f"{name} is a folder", "Give a file.")
     if not stat.S_ISREG(file_status.st_mode):
         raise error_type(f"{name} is a device, pipe or socket.", "Give a regular file.")
-    add_input(path)
+    register_input_path(path)
     return file_status.st_size
 
 
 def read_head(path: Path, byte_count: int, error_type: type[Px4FuseError]) -> bytes:
     """Read the first ``byte_count`` bytes of a regular file."""
-    file_size(path, error_type)
+    get_file_size(path, error_type)
     return _read_bytes(path, byte_count, error_type, display_name(path))
 
 
@@ -117,16 +119,16 @@ def read_bytes_limited(
         Type ``error_type``: the file cannot be read, is too large or empty.
     """
     name = name or display_name(path)
-    size_bytes = file_size(path, error_type, name)
-    content = (
-        b"" if size_bytes > limit_bytes else _read_bytes(path, size_bytes + 1, error_type, name)
-    )
-    if len(content) > size_bytes:  # the file has grown, or is in /proc, where the size is 0
-        content = _read_bytes(path, limit_bytes + 1, error_type, name)
-    if (actual_size_bytes := max(size_bytes, len(content))) > limit_bytes:
-        raise error_type(
-            format_size_limit(name, actual_size_bytes, limit_bytes), remedy_if_too_large
-        )
+    size_bytes = get_file_size(path, error_type, name)
+    content = b""
+    if size_bytes <= limit_bytes:
+        # Python reserves as much memory as is requested, so the limit is not requested at once
+        content = _read_bytes(path, size_bytes + 1, error_type, name)
+        if len(content) > size_bytes:  # compressed, growing, or in /proc, where the size is 0
+            content = _read_bytes(path, limit_bytes + 1, error_type, name)
+            size_bytes = len(content)
+    if size_bytes > limit_bytes:
+        raise error_type(format_size_limit(name, size_bytes, limit_bytes), remedy_if_too_large)
     if remedy_if_empty is not None and not content:
         raise error_type(f"{name}: the file is empty", remedy_if_empty)
     return content
@@ -165,9 +167,9 @@ def read_text(
     content = read_bytes_limited(
         path, error_type, limit_bytes, name=name, remedy_if_too_large=remedy_if_too_large
     )
-    is_utf16 = content.startswith((b"\xff\xfe", b"\xfe\xff"))
+    is_utf_16 = content.startswith(UTF_16_BYTE_ORDER_MARKS)
     try:
-        return content.decode("utf-16" if is_utf16 else "utf-8-sig")
+        return content.decode("utf-16" if is_utf_16 else "utf-8-sig")
     except UnicodeDecodeError as error:
         raise error_type(
             f"{name} is not a text file in UTF-8: the byte at position {error.start} is invalid.",
@@ -192,9 +194,9 @@ def hash_files(paths: Iterable[Path]) -> dict[str, Path]:
             files = [
                 folder_file
                 for folder_file in list_files_recursively(path)
-                if folder_file.is_file() and file_size(folder_file, LogError) <= limit_bytes
+                if folder_file.is_file() and get_file_size(folder_file, LogError) <= limit_bytes
             ]
-        elif (size_bytes := file_size(path, LogError)) > limit_bytes:
+        elif (size_bytes := get_file_size(path, LogError)) > limit_bytes:
             raise LogError(
                 format_size_limit(display_name(path), size_bytes, limit_bytes), LOG_SIZE_REMEDY
             )
@@ -216,6 +218,7 @@ def list_files_recursively(folder: Path) -> list[Path]:
     A folder that cannot be listed is returned too, so that reading it raises an error.
     """
     files: list[Path] = []
+    # os.walk of Python 3.11 is recursive, so it fails for deeply nested folders
     pending_folders = [folder]
     while pending_folders:
         folder_path = pending_folders.pop()

@@ -32,12 +32,12 @@ def one_line_repr(result: Any) -> str:
     """
     field_names = getattr(result, "__struct_fields__", None) or result.__dataclass_fields__
     values = ((name, getattr(result, name)) for name in field_names)
-    field_texts = ", ".join(
+    fields_text = ", ".join(
         f"{name}={_format_value(value)}"
         for name, value in values
         if not isinstance(value, UnsetType | None)
     )
-    return f"{type(result).__name__}({field_texts})"
+    return f"{type(result).__name__}({fields_text})"
 
 
 def _format_value(value: Any) -> str:
@@ -54,7 +54,7 @@ def _format_value(value: Any) -> str:
     return f"<{len(value):,}>" if isinstance(value, Mapping | tuple) else type(value).__name__
 
 
-NotNegative = Annotated[float, Meta(ge=0.0)]
+NonNegativeFloat = Annotated[float, Meta(ge=0.0)]
 PositiveFloat = Annotated[float, Meta(gt=0.0)]
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 Correlation = Annotated[float, Meta(ge=-1.0, le=1.0)]

@@ -33,7 +33,7 @@ UNIT_BY_SUFFIX = {
 }
 # Conversion factors to the base unit of each quantity
 _UNIT_FACTORS: Mapping[str, Mapping[str, float]] = _UNIT_TABLES["typed"]
-_NUMBER_WITH_UNIT = re.compile(r"([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*(\S*)", re.IGNORECASE)
+_NUMBER_WITH_UNIT_PATTERN = re.compile(r"([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*(\S*)", re.IGNORECASE)
 FORMULA_START_CHARACTERS = "=+-@"
 # Maximum length (characters) of a table cell; Excel allows 32,767
 MAX_CELL_LENGTH = 32_000
@@ -117,7 +117,7 @@ def format_factor(factor: float) -> str:
     return format_number(factor, 3 if factor < 2.0 else 2)
 
 
-def capitalise_first(text: str) -> str:
+def capitalise_first_letter(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
@@ -192,10 +192,10 @@ def clean_text(text: str) -> str:
     )
 
 
-def one_line(text: str, max_length: int) -> str:
+def shorten_to_line(text: str, max_length: int) -> str:
     r"""Clean a text (:func:`clean_text`) and shorten it to one line of ``max_length`` characters.
 
-    >>> one_line("a\nb\t c", 4)
+    >>> shorten_to_line("a\nb\t c", 4)
     'a b…'
     """
     # shorten first: cleaning millions of characters is slow
@@ -226,11 +226,14 @@ def convert_to_unit(text: str, unit: str) -> float | None:
     >>> convert_to_unit("10cm", "m"), convert_to_unit("0,5", "s"), convert_to_unit("10 apples", "m")
     (0.1, 0.5, None)
     """
-    match = _NUMBER_WITH_UNIT.fullmatch(text.strip())
+    match = _NUMBER_WITH_UNIT_PATTERN.fullmatch(text.strip())
+    if match is None:
+        return None
     unit = unit.lower()
-    unit_in_text = match[2].lower() or unit if match else ""
+    unit_in_text = match[2].lower() or unit
+    # Units without other units of the same quantity are not in the tables
     for factors in ({unit: 1.0}, *_UNIT_FACTORS.values()):
-        if match and {unit_in_text, unit} <= factors.keys():
+        if {unit_in_text, unit} <= factors.keys():
             with suppress(ValueError):  # float() rejects several decimal points
                 return float(match[1].replace(",", ".")) * (factors[unit_in_text] / factors[unit])
     return None

@@ -18,7 +18,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
-from px4fuse.core.text import one_line
+from px4fuse.core.text import shorten_to_line
 from px4fuse.core.threads import ONE_THREAD_ENVIRONMENT
 from px4fuse.errors import Px4FuseError
 
@@ -73,6 +73,13 @@ class _Worker:
         self.process.join()
         self.process.close()
         self.pipe.close()
+
+    def send(self, job: object, timeout_s: float) -> None:
+        """Start a job, which may last ``timeout_s``."""
+        self.deadline = time.monotonic() + timeout_s
+        # a dead worker process is found at the next read of its pipe
+        with suppress(BrokenPipeError, ConnectionResetError):
+            self.pipe.send(job)
 
 
 @contextmanager
@@ -150,29 +157,24 @@ def poll_with_limits(
                 if pipe in ready_pipes:
                     is_usable, result = _receive_result(worker)
                     if is_usable and not worker.is_ready:
+                        # The first message is not a result: the process is ready for its job
                         worker.is_ready = True
-                    else:
-                        yield worker.job_index, result
-                        worker.finished_count += 1
-                        if (
-                            not is_usable
-                            or worker.finished_count >= MAX_JOBS_PER_WORKER
-                            or not waiting_indices
-                        ):
-                            workers.pop(pipe).terminate()
-                            continue
-                        worker.job_index = waiting_indices.pop()
-                    worker.deadline = time.monotonic() + timeout_s
-                    # a dead worker process is found at the next read of its pipe
-                    with suppress(BrokenPipeError, ConnectionResetError):
-                        pipe.send(jobs[worker.job_index])
+                        worker.send(jobs[worker.job_index], timeout_s)
+                        continue
                 elif time.monotonic() >= worker.deadline:
+                    is_usable = False
                     time_limit_s = timeout_s if worker.is_ready else WORKER_START_TIMEOUT_S
+                    result = JobFailure(f"the job exceeded the time limit of {time_limit_s:g} s.")
+                else:
+                    continue
+                outcome = worker.job_index, result
+                worker.finished_count += 1
+                if is_usable and waiting_indices and worker.finished_count < MAX_JOBS_PER_WORKER:
+                    worker.job_index = waiting_indices.pop()
+                    worker.send(jobs[worker.job_index], timeout_s)
+                else:
                     workers.pop(pipe).terminate()
-                    yield (
-                        worker.job_index,
-                        JobFailure(f"the job exceeded the time limit of {time_limit_s:g} s."),
-                    )
+                yield outcome
     finally:
         for worker in workers.values():
             worker.terminate()
@@ -233,7 +235,7 @@ def _run_and_pickle(function: Callable[[Any], Any], job: Any) -> bytes:
         return pickle.dumps((False, JobFailure("the job exceeded the memory limit for one file.")))
     except Exception as error:  # noqa: BLE001 - the failure of a job is its result
         error_prefix = "" if isinstance(error, Px4FuseError) else f"{type(error).__name__}: "
-        return pickle.dumps((True, JobFailure(one_line(f"{error_prefix}{error}", 300))))
+        return pickle.dumps((True, JobFailure(shorten_to_line(f"{error_prefix}{error}", 300))))
 
 
 def _end_with_parent() -> None:

@@ -13,7 +13,7 @@ from px4fuse.errors import OutputError
 
 STANDARD_OUTPUT = Path("-")
 # Windows does not replace a file that another program has open
-LOCKS_OPEN_FILES = sys.platform == "win32"
+OPERATING_SYSTEM_LOCKS_OPEN_FILES = sys.platform == "win32"
 # Advice to the user if an output cannot be written, by error number
 REMEDY_BY_ERRNO = {
     errno.ENOSPC: "Free disk space, or choose another disk.",
@@ -113,6 +113,6 @@ def _make_output_error(path: Path, error: OSError, written_files: Sequence[Path]
     if written_files:
         faults.append(format_written_outputs(written_files))
     remedy = REMEDY_BY_ERRNO.get(error.errno or 0, "Choose another output name.")
-    if LOCKS_OPEN_FILES and isinstance(error, PermissionError):
+    if OPERATING_SYSTEM_LOCKS_OPEN_FILES and isinstance(error, PermissionError):
         remedy = "Close the program that has the file open, or choose another output name."
     return OutputError("; ".join(faults), remedy)

@@ -12,7 +12,15 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray, compute_median_interval_s
-from px4fuse.core.record import Correlation, Count, NotNegative, PositiveFloat, Record, Share, Span
+from px4fuse.core.record import (
+    Correlation,
+    Count,
+    NonNegativeFloat,
+    PositiveFloat,
+    Record,
+    Share,
+    Span,
+)
 from px4fuse.ekf2.heights import GNSS_HEIGHT_NOISE_FACTOR
 from px4fuse.filter.consistency import Consistency, classify_mean_nis, compute_nis_band
 from px4fuse.flight.ekf2_parameters import AIDS, Aid
@@ -49,7 +57,7 @@ MAX_LOG_INTERVALS_WITHOUT_FUSION = 10.0
 # Maximum relative difference between √R and the noise parameter from which EKF2 computes R
 NOISE_RELATIVE_TOLERANCE = 0.02
 # Minimum height (m) of the evaluation: near the ground, rotor downwash disturbs the barometer
-MIN_HEIGHT_M = 2.0
+MIN_EVALUATION_HEIGHT_M = 2.0
 # Window length (barometer samples) of the running median of the height
 HEIGHT_MEDIAN_FILTER_LENGTH = 11
 
@@ -71,10 +79,10 @@ class AidAxisStatistics(Record, kw_only=True):
 
     samples: Count
     innovation_mean: float
-    innovation_std: NotNegative
+    innovation_std: NonNegativeFloat
     s_sqrt_median: PositiveFloat
     nis_mean: PositiveFloat
-    nis_band: tuple[NotNegative, NotNegative]
+    nis_band: tuple[NonNegativeFloat, NonNegativeFloat]
     sigma_ratio: PositiveFloat
     rejected_fraction: Share
     lag1_autocorrelation: Correlation
@@ -154,7 +162,7 @@ def find_flight_span(flight: Flight) -> Span | Unavailable:
         )
         height_m = (down_m.dropna().iloc[0] if down_m.notna().any() else 0.0) - down_m
         times_above_min_height_s = height_m.index[
-            height_m > min(MIN_HEIGHT_M, height_m.max() / 2.0)
+            height_m > min(MIN_EVALUATION_HEIGHT_M, height_m.max() / 2.0)
         ]
         if len(times_above_min_height_s):
             start, end = times_above_min_height_s[[0, -1]].tolist()
@@ -192,6 +200,7 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         return samples[[f"{name}_{axis}" for axis in aid_log.axes]].to_numpy()
 
     innovation, innovation_variance = map(select_axis_columns, ("innovation", "variance"))
+    max_gap_s = MAX_TIME_WITHOUT_FUSION_S
     is_enabled = _was_enabled(aid_log, sample_times_s)
     is_fusion_logged = "fused" in samples
     is_reset = np.zeros(len(samples), bool)
@@ -208,17 +217,19 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
     else:
         is_rejected = np.max(innovation**2 / innovation_variance, axis=1, initial=0.0) > gate**2
         is_fused = ~is_rejected
+        # The log may contain only a part of the fused samples
+        if is_fused.sum() > 1:
+            log_interval_s = compute_median_interval_s(sample_times_s[is_fused])
+            max_gap_s = max(max_gap_s, MAX_LOG_INTERVALS_WITHOUT_FUSION * log_interval_s)
     is_evaluated = (is_fused | is_rejected) & is_enabled & ~is_reset
     longest_gap_s = _find_longest_gap(
         sample_times_s[is_fused & is_enabled], aid_log, start_s, end_s
     )
     axes = {}
-    for axis_index, axis in enumerate(aid_log.axes):
-        consistency = Consistency.from_innovations(
-            innovation[is_evaluated, axis_index],
-            innovation_variance[is_evaluated, axis_index],
-            gate,
-        )
+    for axis, nu, S in zip(
+        aid_log.axes, innovation[is_evaluated].T, innovation_variance[is_evaluated].T, strict=True
+    ):
+        consistency = Consistency.from_innovations(nu, S, gate)
         if not isinstance(consistency, Unavailable):
             axes[axis] = AidAxisStatistics(
                 samples=consistency.count,
@@ -232,12 +243,16 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
                 bias_p=consistency.bias_p,
                 lag1_autocorrelation=consistency.lag1_autocorrelation,
                 ljung_box_p=consistency.ljung_box_p,
-                change=_find_largest_mean_change(
-                    sample_times_s[is_evaluated],
-                    innovation[is_evaluated, axis_index]
-                    / np.sqrt(innovation_variance[is_evaluated, axis_index]),
+                change=_find_largest_innovation_mean_change(
+                    sample_times_s[is_evaluated], nu / np.sqrt(S)
                 ),
             )
+    fused_fraction = rejected_fraction = 0.0
+    if is_enabled.any():
+        fused_fraction, rejected_fraction = (
+            float(np.mean(mask[is_enabled])) for mask in (is_fused, is_rejected)
+        )
+    is_gap_too_long = longest_gap_s[1] - longest_gap_s[0] > max_gap_s
     return AidResult(
         label=aid.label,
         unit=aid.unit,
@@ -245,20 +260,16 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         enabled_fraction=None
         if aid_log.enabled is None
         else float(np.mean(_was_enabled(aid_log, np.arange(start_s, end_s, 0.1)))),
-        fused_fraction=float(np.mean(is_fused[is_enabled])) if is_enabled.any() else 0.0,
+        fused_fraction=fused_fraction,
         fused_logged=is_fusion_logged,
-        rejected_fraction=float(np.mean(is_rejected[is_enabled])) if is_enabled.any() else 0.0,
+        rejected_fraction=rejected_fraction,
         longest_gap_s=longest_gap_s,
         resets=int(is_reset.sum()),
         gate=gate,
         noise=noise_sigma_median,
         noise_from=_find_noise_origin(aid, aid_log, noise_sigma_median),
         axes=axes,
-        verdict=_classify_aid(
-            axes, longest_gap_s, sample_times_s[is_fused & (not is_fusion_logged)]
-        )
-        if is_evaluated.any()
-        else "disabled",
+        verdict=_classify_aid(axes, is_gap_too_long) if is_evaluated.any() else "disabled",
     )
 
 
@@ -269,7 +280,9 @@ def _was_enabled(aid_log: AidLog, times_s: Array) -> BoolArray:
     return sample_step_function(aid_log.enabled, times_s) > 0.0
 
 
-def _find_largest_mean_change(time_s: Array, normalised_innovations: Array) -> Span | None:
+def _find_largest_innovation_mean_change(
+    time_s: Array, normalised_innovations: Array
+) -> Span | None:
     """Return time (s) and size (in √S) of the largest significant change of the mean innovation.
 
     Return None if no change is significant.
@@ -280,21 +293,24 @@ def _find_largest_mean_change(time_s: Array, normalised_innovations: Array) -> S
     window_means = windows["mean"].to_numpy()
     largest_mean_change = None
     min_mean_change = MIN_MEAN_CHANGE_IN_SIGMA
+    # The change happens in window ``index``. The means before and after exclude this window
     for index in range(MIN_WINDOWS_BEFORE_MEAN_CHANGE, len(window_means) - 2):
         mean_before_window = np.mean(window_means[:index])
         mean_change = float(np.mean(window_means[index + 1 : index + 3]) - mean_before_window)
-        normalised_std = np.std(normalised_innovations[window_index < windows.index[index]])
-        standard_error = normalised_std / math.sqrt(2.0 * windows["size"].iloc[:index].median())
+        std_before_window = np.std(normalised_innovations[window_index < windows.index[index]])
+        # Standard error of a mean of two windows
+        standard_error = std_before_window / math.sqrt(2.0 * windows["size"].iloc[:index].median())
         scatter_of_window_means = max(np.std(window_means[:index], ddof=1), standard_error)
         if abs(mean_change) > max(
             min_mean_change, MIN_MEAN_CHANGE_TO_SCATTER_RATIO * scatter_of_window_means
         ):
-            is_change_in_window = (
-                abs(window_means[index] - mean_before_window) > abs(mean_change) / 3.0
+            # If this window still has the earlier mean, the change begins with the next window
+            has_earlier_mean = (
+                abs(window_means[index] - mean_before_window) <= abs(mean_change) / 3.0
             )
-            first_changed_window_index = windows.index[index if is_change_in_window else index + 1]
+            first_changed_window = windows.index[index + has_earlier_mean]
             largest_mean_change = (
-                float(time_s[0] + INNOVATION_MEAN_WINDOW_S * first_changed_window_index),
+                float(time_s[0] + INNOVATION_MEAN_WINDOW_S * first_changed_window),
                 mean_change,
             )
             min_mean_change = abs(mean_change)
@@ -341,13 +357,8 @@ def _find_longest_gap(fusion_times_s: Array, aid_log: AidLog, start_s: float, en
     return float(gap_limits_s[longest_index]), float(gap_limits_s[longest_index + 1])
 
 
-def _classify_aid(
-    axes: dict[str, AidAxisStatistics], longest_gap_s: Span, fusion_times_s: Array
-) -> AidVerdict:
-    interval_s = compute_median_interval_s(fusion_times_s) if len(fusion_times_s) > 1 else 0.0
-    if longest_gap_s[1] - longest_gap_s[0] > max(
-        MAX_TIME_WITHOUT_FUSION_S, MAX_LOG_INTERVALS_WITHOUT_FUSION * interval_s
-    ):
+def _classify_aid(axes: dict[str, AidAxisStatistics], is_gap_too_long: bool) -> AidVerdict:
+    if is_gap_too_long:
         return "not_fused"
     if not axes:
         return "too few samples"

@@ -17,9 +17,9 @@ from px4fuse.flight.ekf2_parameters import BAROMETER
 from px4fuse.flight.model import GROUND_EFFECT_FLAG, Ekf2, FusionRecord
 
 # Default rate (Hz) at which EKF2 fuses the barometer, PX4 v1.15 and later
-BAROMETER_HZ = 10.0
+BAROMETER_FUSION_RATE_HZ = 10.0
 # Rate (Hz) at which EKF2 fuses the barometer before PX4 v1.15
-BAROMETER_HZ_BEFORE_V1_15 = 15.0
+BAROMETER_FUSION_RATE_HZ_BEFORE_V1_15 = 15.0
 # The sample interval is estimated at each bias update in the log. The median is used only if the
 # interquartile range ÷ median of the estimates is below this value
 MAX_RELATIVE_SPREAD_OF_INTERVALS = 0.1
@@ -42,19 +42,24 @@ def estimate_barometer_interval_s(fusion_record: FusionRecord) -> float:
     """
     barometer_bias_updates = fusion_record.height_bias_updates.get(BAROMETER.name)
     if barometer_bias_updates is not None and len(barometer_bias_updates) > 1:
-        variance_m2 = barometer_bias_updates["variance_m2"] * _compute_bias_gain(
+        # Bias variance before an update: K S. In the steady state, it exceeds the variance after
+        # an update by the process noise of one sample interval. The first fifth may be transient
+        prior_variance_m2 = barometer_bias_updates["variance_m2"] * _compute_bias_gain(
             barometer_bias_updates
         )
-        intervals_s = (variance_m2 - barometer_bias_updates["bias_m2"])[
-            len(barometer_bias_updates) // 5 :
-        ] / POSITION_BIAS_NOISE_M_PER_SQRT_S**2
+        variance_growth_m2 = prior_variance_m2 - barometer_bias_updates["bias_m2"]
+        intervals_s = (
+            variance_growth_m2[len(variance_growth_m2) // 5 :] / POSITION_BIAS_NOISE_M_PER_SQRT_S**2
+        )
         lower_quartile_s, median_s, upper_quartile_s = np.percentile(
             intervals_s, [25.0, 50.0, 75.0]
         )
         if upper_quartile_s - lower_quartile_s < MAX_RELATIVE_SPREAD_OF_INTERVALS * median_s:
             return float(median_s)
     return 1.0 / (
-        BAROMETER_HZ_BEFORE_V1_15 if fusion_record.has_delta_angle_biases else BAROMETER_HZ
+        BAROMETER_FUSION_RATE_HZ_BEFORE_V1_15
+        if fusion_record.has_delta_angle_biases
+        else BAROMETER_FUSION_RATE_HZ
     )
 
 
@@ -165,17 +170,17 @@ def _combine_barometer_samples(
     )
     row_index = np.minimum(row_index, len(sample_count) - 1)
     intervals_since_row = (time_s - row_times_s[row_index]) / sample_interval_by_row_s[row_index]
-    is_on_sample_grid = is_regular[row_index] & (
-        np.abs(intervals_since_row - np.rint(intervals_since_row))
-        < SAME_SAMPLE_TOLERANCE_IN_INTERVALS
+    # Number of the sample since the previous row, from 1 to sample_count
+    sample_number = np.rint(intervals_since_row).astype(int)
+    is_on_sample_grid = (
+        is_regular[row_index]
+        & (np.abs(intervals_since_row - sample_number) < SAME_SAMPLE_TOLERANCE_IN_INTERVALS)
+        & (sample_number >= 1)
+        & (sample_number <= sample_count[row_index])
     )
-    is_on_sample_grid &= (intervals_since_row > SAME_SAMPLE_TOLERANCE_IN_INTERVALS) & (
-        intervals_since_row < sample_count[row_index] + SAME_SAMPLE_TOLERANCE_IN_INTERVALS
-    )
-    innovation_m[
-        row_index[is_on_sample_grid],
-        np.rint(intervals_since_row[is_on_sample_grid]).astype(int) - 1,
-    ] = (down_m - predict_measured_down_m(time_s))[is_on_sample_grid]
+    innovation_m[row_index[is_on_sample_grid], sample_number[is_on_sample_grid] - 1] = (
+        down_m - predict_measured_down_m(time_s)
+    )[is_on_sample_grid]
     if "filtered_down" in logged_barometer_updates:
         # PX4 logs the filtered innovation with the opposite sign: state minus measurement
         low_pass_filtered_innovation_m = -logged_barometer_updates["filtered_down"].to_numpy()
@@ -231,27 +236,24 @@ def _simulate_missing_innovations(
     low_pass_filtered_innovation_m : ndarray, shape (n + 1,)
         Logged low-pass filtered innovations.
     """
-    new_sample_weight = interval_s / (interval_s + INNOVATION_LOW_PASS_TIME_CONSTANT_S)
-    low_pass_weight = new_sample_weight * (1.0 - new_sample_weight) ** np.maximum(
-        age_in_samples, 0.0
-    )
-    low_pass_weight_if_missing = low_pass_weight * is_missing
+    # With the weight w of a new sample, the logged filtered innovation after the samples ν of age
+    # k - 1 to 0 is f = (1 - w)^k f_previous + Σ w (1 - w)^age ν. All missing innovations of an
+    # interval are shifted by the same offset, so that this equation holds
+    w = interval_s / (interval_s + INNOVATION_LOW_PASS_TIME_CONSTANT_S)
+    low_pass_weight = w * (1.0 - w) ** np.maximum(age_in_samples, 0.0)
     simulated_innovation_m = np.random.default_rng(0).normal(
         scale=np.nanstd(innovation_m), size=innovation_m.shape
     )
-    previous_filtered_innovation_weight = (1.0 - new_sample_weight[:, 0]) ** (
-        age_in_samples[:, 0] + 1.0
-    )
-    low_pass_weighted_sum_m = np.nansum(low_pass_weight * innovation_m, axis=1) + (
-        low_pass_weight_if_missing * simulated_innovation_m
-    ).sum(axis=1)
+    # Columns after the last sample are neither missing nor known
+    filled_innovation_m = np.where(is_missing, simulated_innovation_m, innovation_m)
+    previous_filtered_innovation_weight = (1.0 - w[:, 0]) ** (age_in_samples[:, 0] + 1.0)
     simulated_innovation_offset_m = (
         low_pass_filtered_innovation_m[1:]
         - previous_filtered_innovation_weight * low_pass_filtered_innovation_m[:-1]
-        - low_pass_weighted_sum_m
+        - np.nansum(low_pass_weight * filled_innovation_m, axis=1)
     )
     simulated_innovation_offset_m /= np.maximum(
-        low_pass_weight_if_missing.sum(axis=1), MIN_WEIGHT_SUM_OF_MISSING_SAMPLES
+        (low_pass_weight * is_missing).sum(axis=1), MIN_WEIGHT_SUM_OF_MISSING_SAMPLES
     )
     return np.where(
         is_missing, simulated_innovation_m + simulated_innovation_offset_m[:, None], innovation_m

@@ -72,6 +72,7 @@ class BiasEstimator:
             POSITION_BIAS_NOISE_M_PER_SQRT_S**2,
         )
         bias_variance = np.minimum(self.variance_m2 + bias_noise_m2_per_s * interval_s, R_m2)
+        # The bias is state minus measurement: it is added to ν, and its own innovation is -ν
         innovation_m = innovation_m + self.bias_m
         R = R_m2 + bias_variance
         # The mean of n samples has 1/n of the variance of one sample; the bias is the same for all
@@ -82,6 +83,7 @@ class BiasEstimator:
         self.variance_m2 = np.maximum(
             bias_variance - K * bias_variance, MIN_POSITION_BIAS_VARIANCE_M2
         )
+        # EKF2 filters the test ratio with the sign of the bias innovation, which is opposite to ν
         signed_test_ratio = np.copysign(np.minimum(test_ratio, 1.0), -innovation_m)
         self.mean_signed_test_ratio = self.mean_signed_test_ratio + (
             self.test_ratio_filter_weight

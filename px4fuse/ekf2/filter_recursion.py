@@ -3,20 +3,21 @@
 Several filter configurations are computed at once. Each event fuses a position. In a gap of the
 position source, an event fuses only height and heading.
 
-Symbols: x, P: state and covariance; R: measurement noise; S: innovation variance.
+Symbols: x, P: state and covariance; ν: innovation; R: measurement noise; S: innovation variance.
 
 Sources: PX4-Autopilot ``EKF/covariance.cpp`` (limits of the biases), ``EKF/position_fusion.cpp``
 and ``EKF/vel_pos_fusion.cpp`` (gate, fusion), ``ev_pos_control.cpp`` (noise, resets).
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from px4fuse.core.arrays import Array, Array32, ArrayPair, BoolArray, IntArray
+from px4fuse.ekf2.filter_batch import FilterBatch, FilterConfiguration
 from px4fuse.ekf2.heights import (
     GNSS_HEIGHT_NOISE_FACTOR,
     MIN_INNOVATION_GATE,
@@ -24,14 +25,13 @@ from px4fuse.ekf2.heights import (
     BadAccelerationFlag,
     HeightFilter,
 )
-from px4fuse.ekf2.inputs import FusionRules, ReplayInputs
+from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.intervals import (
     FUSE,
     NO_ACTION,
     START_FUSION,
     EventIntervals,
-    FusionDelays,
-    StepEvents,
+    FusionEvents,
     make_event_intervals,
 )
 from px4fuse.ekf2.magnetometer import (
@@ -42,7 +42,7 @@ from px4fuse.ekf2.magnetometer import (
 )
 from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
-    BIASES,
+    BODY_MAGNETIC_FIELD,
     EARTH_MAGNETIC_FIELD,
     GRAVITY_M_S2,
     GYRO_BIAS,
@@ -51,28 +51,18 @@ from px4fuse.ekf2.replay_segments import (
     THETA,
     VELOCITY,
     ReplaySegment,
+    SensorSamples,
 )
-from px4fuse.ekf2.vision import VisionFilter, group_vision_by_event, set_states
-from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
+from px4fuse.ekf2.vision import VisionFilter, set_states
+from px4fuse.flight.ekf2_parameters import FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
 
 # Minimum state variance; prevents a division by zero
 MIN_STATE_VARIANCE = 1e-30
 # Number of events whose transition matrices are copied at once; limits the memory
-EVENT_BATCH_SIZE = 64
-# Measurement variance (m² or rad²) so large that the measurement has no effect
-VARIANCE_WITHOUT_EFFECT = 1e9
+EVENT_BATCH_SIZE = 128
 # Acceleration noise (m/s²) while EKF2 reports a bad or clipped acceleration (BADACC_BIAS_PNOISE,
 # common.h; covariance.cpp)
 BAD_ACCELERATION_NOISE_M_S2 = 4.9
-# EKF2 parameters with these prefixes do not change the vertical innovations
-PARAMETER_PREFIXES_WITHOUT_HEIGHT_EFFECT = (
-    "EKF2_EV",
-    "EKF2_MAG",
-    "EKF2_OF",
-    "EKF2_TAU",
-    "EKF2_GPS_P_GATE",
-    "EKF2_GPS_DELAY",
-)
 # Initial σ (m/s²) of the accelerometer bias, which EKF2 has estimated on the ground
 INITIAL_BIAS_SIGMA_M_S2 = 0.01
 # Factors on the GNSS velocity variance (NED): EKF2 multiplies the vertical σ by 1.5
@@ -88,84 +78,12 @@ MIN_RATIO_TO_LARGEST_BIAS_VARIANCE = 0.01
 HEADING, POSITION_NORTH, POSITION_EAST, POSITION_DOWN = 2, 6, 7, 8
 # State indices of the accelerometer bias
 ACCELEROMETER_BIAS_NORTH, ACCELEROMETER_BIAS_EAST, ACCELEROMETER_BIAS_DOWN = 12, 13, 14
-# States that are measured in one joint update, in the order of the measurements
-STATES_FUSED_IN_ONE_UPDATE = np.array([HEADING, POSITION_DOWN, POSITION_NORTH, POSITION_EAST])
-# State indices of heading error and height, as a slice to avoid copies
-HEADING_AND_DOWN = slice(HEADING, POSITION_DOWN + 1, POSITION_DOWN - HEADING)
 HORIZONTAL_POSITION = slice(POSITION_NORTH, POSITION_EAST + 1)
 # State indices of velocity and position
 VELOCITY_AND_POSITION = slice(3, 9)
 # Columns in measurements of velocity (0 to 2) and position (3 to 5), NED
 VELOCITY_COLUMNS, VELOCITY_DOWN_COLUMN = slice(0, 3), 2
-HORIZONTAL_POSITION_COLUMNS = slice(3, 5)
-# First column of velocity, of horizontal position and of height in the same measurements
-FIRST_COLUMNS = [0, 3, 5]
-
-
-@dataclass(frozen=True)
-class FilterConfiguration:
-    """Configuration of the EKF2 model: parameters, estimated states and fused sources.
-
-    Attributes
-    ----------
-    settings : dict
-        Values of all EKF2 parameters, by PX4 name.
-    estimates_biases : bool
-        True if the accelerometer bias is a state.
-    estimates_attitude : bool
-        True if attitude and gyro bias are states.
-    fuses_velocity : bool
-        False to ignore the velocity of the position source.
-    uses_reported_noise : bool
-        False to ignore the variance that the position source reports.
-    has_gate : bool
-        False to fuse every sample.
-    uses_logged_decisions : bool
-        True to use EKF2's logged rejections and resets.
-    disable_time_s_by_aid : mapping from PX4's name of an aiding source to float
-        Time (s) from which the source is not fused.
-    timestamp_offset_s : float or None
-        Time that is added to position timestamps, instead of EKF2's delay parameter.
-    """
-
-    settings: dict[str, float]
-    estimates_biases: bool = True
-    estimates_attitude: bool = True
-    fuses_velocity: bool = True
-    uses_reported_noise: bool = True
-    has_gate: bool = True
-    uses_logged_decisions: bool = False
-    disable_time_s_by_aid: Mapping[str, float] = field(default_factory=dict)
-    timestamp_offset_s: float | None = None
-
-    def can_use_logged_bad_acceleration_flag(self, inputs: ReplayInputs) -> bool:
-        """Return True if EKF2's logged bad-acceleration flag is valid for this configuration.
-
-        The flag depends on the height parameters.
-        """
-        has_logged_height_parameters = not self.disable_time_s_by_aid and all(
-            value == inputs.settings[name]
-            or name.startswith(PARAMETER_PREFIXES_WITHOUT_HEIGHT_EFFECT)
-            for name, value in self.settings.items()
-        )
-        return self.uses_logged_decisions or has_logged_height_parameters
-
-    def compute_delays(self, inputs: ReplayInputs) -> FusionDelays:
-        """Return the delay of the position source, and the delay of the fusion horizon."""
-        if self.timestamp_offset_s is not None:
-            return FusionDelays(-self.timestamp_offset_s - 0.5 * inputs.mean_step_s, np.inf)
-        delay_s = self.settings[inputs.aid.delay] * 1e-3
-        max_delay_ms = max(self.settings.get(aid.delay, 0.0) for aid in (GNSS_POS, EV_POS))
-        min_horizon_s = inputs.horizon_s
-        if not inputs.rules.is_horizon_set_by_largest_delay:
-            # EKF2 raises EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp)
-            max_delay_ms = max(max_delay_ms, self.settings["EKF2_DELAY_MAX"])
-            if max_delay_ms == inputs.settings["EKF2_DELAY_MAX"]:
-                return FusionDelays(delay_s, inputs.horizon_s)
-            min_horizon_s = inputs.mean_step_s
-        # Number of samples in the IMU buffer (initialise_interface, estimator_interface.cpp)
-        buffer_length = math.ceil(max_delay_ms * 1e-3 / inputs.configured_step_s)
-        return FusionDelays(delay_s, max((buffer_length - 1) * inputs.mean_step_s, min_horizon_s))
+HORIZONTAL_POSITION_COLUMNS, DOWN_COLUMN = slice(3, 5), 5
 
 
 @dataclass(frozen=True)
@@ -196,7 +114,7 @@ class SegmentRun:
 
     segment: ReplaySegment
     configurations: tuple[FilterConfiguration, ...]
-    events: tuple[StepEvents, ...]
+    events: tuple[FusionEvents, ...]
     innovation: Array
     innovation_variance: Array32
     noise: Array32
@@ -212,7 +130,7 @@ class SegmentRun:
     vision_filter: VisionFilter | None = None
 
 
-def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
+def run_segment(  # noqa: PLR0912, PLR0915 (the order of EKF2's fusions in one place)
     inputs: ReplayInputs,
     segment: ReplaySegment,
     configurations: Sequence[FilterConfiguration],
@@ -222,347 +140,97 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
 
     ``intervals`` contains the intervals between fusions, one item per configuration.
     """
-    configuration_count = len(configurations)
-    event_count = len(intervals[0].events)
-    parameters = {
-        name: np.array([configuration.settings[name] for configuration in configurations])
-        for name in inputs.settings
-    }
-    # A parameter change in flight applies only to configurations with the logged parameter value
-    for name in segment.changed_parameters.keys() & parameters.keys():
-        value = segment.changed_parameters[name]
-        parameters[name][parameters[name] == inputs.settings[name]] = value
-    (
-        estimates_biases,
-        estimates_attitude,
-        has_gate,
-        uses_logged_decisions,
-        uses_reported_noise,
-        fuses_velocity,
-    ) = np.array(
-        [
-            (
-                configuration.estimates_biases,
-                configuration.estimates_attitude,
-                configuration.has_gate,
-                configuration.uses_logged_decisions,
-                configuration.uses_reported_noise,
-                configuration.fuses_velocity,
-            )
-            for configuration in configurations
-        ]
-    ).T
-    # The arrays of events have the shape (events, configurations, ...)
-    events = np.stack([interval_arrays.events for interval_arrays in intervals], axis=1)
-    event_steps = events["end_step"]
-    event_time_s = segment.time_s[event_steps]
-    action = np.where(has_gate, events["action"], FUSE * events["usable"])
-    has_action = action > NO_ACTION
-    has_sample = np.any(has_action, axis=1).tolist()
-    is_enabled_by_aid = {
-        name: event_time_s
-        < np.array([one.disable_time_s_by_aid.get(name, np.inf) for one in configurations])
-        for name in AIDS
-    }
-    can_fuse_velocity = (action == FUSE) & is_enabled_by_aid[GNSS_VEL.name] & fuses_velocity
-    sample_indices = np.maximum(intervals[0].events.sample, 0)
-    measured_values, measurement_variance = _collect_measurements(
-        inputs, segment, sample_indices, event_steps, parameters, uses_reported_noise
-    )
-    has_velocity = inputs.received_positions.velocity_m_s is not None
-    position_gate = parameters[inputs.aid.gate]
-    gates = parameters.get(GNSS_VEL.gate, position_gate), position_gate
-    gate_squared = np.maximum(np.repeat(gates, 3, axis=0).T, MIN_INNOVATION_GATE) ** 2
-    # Logged height and heading, for replays without height sensor or magnetometer
-    logged_heading_and_down = np.stack(
-        [segment.attitude_error_rad[event_steps, HEADING], segment.down_m[event_steps]], axis=-1
-    )
-    attitude_variance = segment.attitude_variance_rad2[event_steps]
-    heading_and_down_variance = np.stack(
-        [attitude_variance[:, :, HEADING], segment.down_variance_m2[event_steps]], axis=-1
-    )
-    has_magnetometer = segment.magnetic_field is not None
-    sensor_means = []
-    for aid, samples in ((MAG, segment.magnetic_field), (FLOW, segment.flow)):
-        if samples is not None:
-            mean_samples = EventSamples(
-                *_stack_by_filter(
-                    [average_by_event(segment, samples, end_steps) for end_steps in event_steps.T]
-                )
-            )
-            mean_samples.sample_count[:] *= is_enabled_by_aid[aid.name]
-            if aid == MAG:
-                R = np.maximum(parameters[MAG.noise], MIN_MAGNETOMETER_SIGMA_GAUSS) ** 2
-                mean_samples.noise[:] = R
-            gate = parameters.get(aid.gate, np.full(configuration_count, samples.gate))
-            sensor_means.append((mean_samples, gate, samples.state_slices))
-    uses_logged_flag = np.array(
-        [
-            segment.height_samples is None
-            or segment.is_acceleration_bad is None
-            or configuration.can_use_logged_bad_acceleration_flag(inputs)
-            for configuration in configurations
-        ]
-    )
-    bad_acceleration_flag = BadAccelerationFlag(
-        uses_logged_flag, inputs.rules.bad_acceleration_flag_duration_s, segment
-    )
+    batch = FilterBatch(inputs, segment, configurations, intervals)
+    bad_acceleration_flag = _make_bad_acceleration_flag(batch)
+    prediction = _Prediction(batch, bad_acceleration_flag)
+    positions = _PositionFusion(batch, bad_acceleration_flag)
+    mean_sensors = [
+        (
+            aid,
+            _average_samples(batch, aid, samples),
+            batch.parameters.get(aid.gate, np.full(len(configurations), samples.gate)),
+            samples.state_slices,
+        )
+        for aid, samples in ((MAG, segment.magnetic_field), (FLOW, segment.flow))
+        if samples is not None
+    ]
     height_filter = vision_filter = None
     if segment.height_samples is not None:
-        height_filter = HeightFilter(
-            segment,
-            event_steps,
-            events["time_s"],
-            has_action,
-            is_enabled_by_aid,
-            parameters,
-            has_gate,
-            bad_acceleration_flag,
-        )
+        height_filter = HeightFilter(batch, positions.has_action, bad_acceleration_flag)
     if inputs.vision_positions is not None:
-        vision_samples = [
-            group_vision_by_event(
-                inputs,
-                segment,
-                end_steps,
-                configuration.settings,
-                configuration.compute_delays(inputs).horizon_s,
-            )
-            for end_steps, configuration in zip(event_steps.T, configurations, strict=True)
-        ]
-        vision_filter = VisionFilter(
-            segment, vision_samples, is_enabled_by_aid, parameters, has_gate, uses_reported_noise
-        )
-    gyro_variance = (estimates_attitude * parameters["EKF2_GYR_NOISE"] ** 2)[:, None, None]
-    variance_growth_per_step, max_variance_with_process_noise = _compute_variance_growth(
-        inputs, segment, parameters, estimates_biases, estimates_attitude
-    )
-    step_counts = np.diff(event_steps, axis=0, prepend=0)
-    acceleration_variance = np.tile(parameters["EKF2_ACC_NOISE"] ** 2, (event_count, 1))
-    if (clipped_fraction := segment.clipped_fraction) is not None:
-        # While an accelerometer clips, EKF2 uses BAD_ACCELERATION_NOISE_M_S2
-        clipped_fraction_sum_by_event = np.diff(
-            np.cumsum(clipped_fraction)[event_steps], axis=0, prepend=clipped_fraction[0]
-        )
-        acceleration_variance += (
-            clipped_fraction_sum_by_event
-            / np.maximum(step_counts, 1)
-            * (BAD_ACCELERATION_NOISE_M_S2**2 - acceleration_variance)
-        )
-    x, P = _make_start_state(segment, estimates_biases, estimates_attitude)
-    if bad_acceleration_flag.until_s[0] > segment.time_s[0]:
-        # While EKF2 flags a bad acceleration, the log contains no accelerometer bias. Start with
-        # the mean vertical bias of the segment
-        set_states(
-            x,
-            P,
-            ~uses_logged_flag & estimates_biases,
-            slice(ACCELEROMETER_BIAS_DOWN, ACCELEROMETER_BIAS_DOWN + 1),
-            np.full((configuration_count, 1), segment.mean_bias_down_m_s2),
-            np.full((configuration_count, 1), INITIAL_BIAS_SIGMA_M_S2**2),
-        )
-    is_aid_enabled = is_enabled_by_aid[inputs.aid.name]
-    fusion_decisions = _FusionDecisions(
-        inputs.rules,
-        segment.time_s[0],
-        np.where(is_aid_enabled, action, NO_ACTION),
-        events["can_start_fusion"] & is_aid_enabled,
-        event_time_s,
-        has_gate,
-        uses_logged_decisions,
-        inputs.received_positions.rejected_flags[sample_indices],
-        inputs.received_positions.is_reset_to_sample[sample_indices],
-        inputs.received_positions.is_every_reset_logged,
-    )
-    innovations = np.full((event_count, configuration_count, 6), np.nan)
-    variances = innovations.astype(np.float32)
+        vision_filter = VisionFilter(batch)
+    x, P = _make_start_state(batch, bad_acceleration_flag)
+    event_count, configuration_count = batch.events.shape
     magnetometer_updates = np.full(
-        (event_count * has_magnetometer, 3, configuration_count, 3), np.nan
+        (event_count * (segment.magnetic_field is not None), 3, configuration_count, 3), np.nan
     )
-    is_rejected, is_fused, is_reset = np.zeros((3, event_count, configuration_count), bool)
-    position_reset_m = np.zeros((event_count, configuration_count, 2))
-    states = np.empty((event_count + 1, configuration_count, x.shape[1]))
+    states = np.empty((event_count + 1, *x.shape))
     state_variances = np.empty(states.shape, np.float32)
-    states[0] = x
-    state_variances[0] = _get_state_variances(P)
-    innovation, R = np.empty((2, configuration_count, 4))
-    is_component_fused = np.zeros((configuration_count, HORIZONTAL_POSITION_COLUMNS.stop), bool)
-    start_s = np.full(configuration_count, segment.time_s[0])
-    reset_rules = [
-        (HORIZONTAL_POSITION, HORIZONTAL_POSITION_COLUMNS, inputs.rules.reset_variance_factor)
-    ]
-    if has_velocity and inputs.rules.resets_velocity:
-        reset_rules.append((VELOCITY, VELOCITY_COLUMNS, 1.0))
+    states[0], state_variances[0] = x, _get_state_variances(P)
     for event in range(event_count):
-        index_in_batch = event % EVENT_BATCH_SIZE
-        if not index_in_batch:
-            event_batch = slice(event, event + EVENT_BATCH_SIZE)
-            transitions = {one: one.compute_transitions(event_batch) for one in set(intervals)}
-            (
-                transition,
-                state_change_by_attitude_correction,
-                state_change_by_acceleration,
-                gyro_noise_covariance,
-                accelerometer_noise_covariance,
-            ) = _stack_by_filter([transitions[one] for one in intervals])
-            state_change = (
-                state_change_by_acceleration
-                + estimates_attitude[:, None] * state_change_by_attitude_correction
-            )
-            process_noise = (
-                gyro_variance * gyro_noise_covariance
-                + acceleration_variance[event_batch, :, None, None] * accelerometer_noise_covariance
-            )
-        phi = transition[index_in_batch]
-        bad_acceleration_fraction = bad_acceleration_flag.compute_bad_acceleration_fraction(
-            event_time_s[event - 1] if event else start_s, event_time_s[event]
-        )
-        # Prediction: x = Φx + u, P = ΦPΦ' + Q
-        x[:, :STATE_COUNT] = (phi @ x[:, :STATE_COUNT, None])[:, :, 0]
-        x[:, :STATE_COUNT] += state_change[index_in_batch]
-        P[:, :STATE_COUNT] = phi @ P[:, :STATE_COUNT]
-        P[:, :, :STATE_COUNT] = P[:, :, :STATE_COUNT] @ np.swapaxes(phi, 1, 2)
-        motion_covariance = P[:, :MOTION_STATE_COUNT, :MOTION_STATE_COUNT]
-        motion_covariance += process_noise[index_in_batch]
-        if bad_acceleration_fraction.any():
-            variance_increase = bad_acceleration_fraction * (
-                BAD_ACCELERATION_NOISE_M_S2**2 - acceleration_variance[event]
-            )
-            motion_covariance += (
-                variance_increase[:, None, None] * accelerometer_noise_covariance[index_in_batch]
-            )
-        is_bias_constant = bad_acceleration_flag.until_s > event_time_s[event]
-        bias_before_fusion = x[:, ACCELEROMETER_BIAS].copy()
+        accelerometer_bias_before_fusion = x[:, ACCELEROMETER_BIAS].copy()
         bias_covariance = P[:, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS].copy()
-        bias_variance = _get_state_variances(P)[:, BIASES.start :]
-        bias_variance += (bias_variance < max_variance_with_process_noise) * (
-            variance_growth_per_step * step_counts[event, :, None]
-        )
-        if min_bias_variance := inputs.rules.min_accelerometer_bias_variance_m2_s4:
-            _limit_bias_variance(P, min_bias_variance, estimates_biases)
-        innovation[:, 2:] = 0.0
-        R[:, 2:] = VARIANCE_WITHOUT_EFFECT
-        for mean_samples, gate, state_slices in sensor_means:
+        prediction.predict(event, x, P)
+        is_accelerometer_bias_constant = bad_acceleration_flag.until_s > batch.event_time_s[event]
+        for aid, mean_samples, gate, state_slices in mean_sensors:
             if mean_samples.sample_count[event].any():
                 mean_sample = EventSamples(*(quantity[event] for quantity in mean_samples))
                 x, P, update = fuse_mean_sample(x, P, mean_sample, gate, *state_slices)
-                if EARTH_MAGNETIC_FIELD in state_slices:
+                if aid == MAG:
                     magnetometer_updates[event] = update
         if vision_filter is not None:
-            x, P = vision_filter.fuse(event, x, P, False, fusion_decisions.last_position_s)
+            x, P = vision_filter.fuse(event, x, P, False, positions.decisions.last_position_s)
         if height_filter is not None:
             x, P = height_filter.fuse_barometer(event, x, P)
-        if has_sample[event]:
-            nu = measured_values[event] - x[:, VELOCITY_AND_POSITION]
-            S = _get_state_variances(P)[:, VELOCITY_AND_POSITION] + measurement_variance[event]
-            is_outside_gate = nu * nu > gate_squared * S
-            if is_outside_gate[:, VELOCITY_DOWN_COLUMN].any():
-                # With a bad vertical acceleration, EKF2 clips the vertical innovation to the gate
-                is_clipped = has_gate & (bad_acceleration_flag.until_s > event_time_s[event])
-                is_clipped &= ~is_outside_gate[:, :VELOCITY_DOWN_COLUMN].any(axis=1)
-                limit = np.sqrt(gate_squared * S)
-                nu[is_clipped, VELOCITY_DOWN_COLUMN] = np.clip(nu, -limit, limit)[
-                    is_clipped, VELOCITY_DOWN_COLUMN
-                ]
-                is_outside_gate[is_clipped, VELOCITY_DOWN_COLUMN] = False
-            innovations[event] = nu
-            variances[event] = S
-            is_velocity_outside, is_position_outside, _ = np.logical_or.reduceat(
-                is_outside_gate, FIRST_COLUMNS, axis=1
-            ).T
-            is_rejected[event], is_fused[event], is_reset[event], is_velocity_fused = (
-                fusion_decisions.decide_fusion(
-                    event,
-                    is_position_outside,
-                    can_fuse_velocity[event] & ~(is_velocity_outside & has_gate),
-                )
-            )
-            if inputs.aid == GNSS_POS:
-                if not has_magnetometer:
-                    # Without a magnetometer, the tilt variance is set to its logged value
-                    for tilt_row in range(HEADING):
-                        _, P = _update_to_variance(
-                            P, tilt_row, attitude_variance[event, :, tilt_row]
-                        )
-                is_component_fused[:, VELOCITY_COLUMNS] = (is_velocity_fused & has_velocity)[
-                    :, None
-                ]
-                is_component_fused[:, HORIZONTAL_POSITION_COLUMNS] = is_fused[event, :, None]
-                x, P = _update_sequentially(
-                    x, P, nu, S, measurement_variance[event], is_component_fused
-                )
-            else:
-                innovation[:, 2:] = nu[:, HORIZONTAL_POSITION_COLUMNS]
-                R[is_fused[event], 2:] = measurement_variance[
-                    event, is_fused[event], HORIZONTAL_POSITION_COLUMNS
-                ]
+        if positions.has_sample[event]:
+            x, P = positions.test_and_fuse_gnss(event, x, P)
         if height_filter is not None:
             x, P = height_filter.fuse_gnss(
-                event, x, P, measured_values[event, :, 5], measurement_variance[event, :, 5]
+                event,
+                x,
+                P,
+                positions.measured_values[event, :, DOWN_COLUMN],
+                positions.measurement_variance[event, :, DOWN_COLUMN],
             )
-        # With a magnetometer, the filter estimates the heading, and only the height is set to its
-        # logged value
-        elif has_magnetometer:
-            K, P = _update_to_variance(P, POSITION_DOWN, heading_and_down_variance[event, :, 1])
-            x = x + K * (logged_heading_and_down[event, :, 1] - x[:, POSITION_DOWN])[:, None]
-            x[:, POSITION_DOWN] = logged_heading_and_down[event, :, 1]
-        if not has_magnetometer:
-            innovation[:, :2] = logged_heading_and_down[event] - x[:, HEADING_AND_DOWN]
-            R[:, :2] = _compute_noise_for_target_variance(
-                _get_state_variances(P)[:, HEADING_AND_DOWN], heading_and_down_variance[event]
-            )
-            heading_error_rad = np.where(estimates_attitude, x[:, HEADING] + innovation[:, 0], 0.0)
-            if inputs.fuses_vision_height or height_filter is not None:
-                R[:, 1] = VARIANCE_WITHOUT_EFFECT
-            if inputs.fuses_vision_height and has_sample[event]:
-                innovation[:, 1] = nu[:, 5]
-                R[has_action[event], 1] = measurement_variance[event, has_action[event], 5]
-            x, P = _update_jointly(x, P, innovation, R)
-            x[:, HEADING] = heading_error_rad
-        if has_sample[event] and is_reset[event].any():
-            for rows, columns, variance_factor in reset_rules:
-                reset_variance = variance_factor * measurement_variance[event, :, columns]
-                set_states(
-                    x, P, is_reset[event], rows, measured_values[event, :, columns], reset_variance
-                )
-            position_reset_m[event] = is_reset[event, :, None] * nu[:, HORIZONTAL_POSITION_COLUMNS]
+        x, P = positions.fuse_vision_and_logged_states(event, x, P)
+        if positions.reset[event].any():
+            positions.reset_states(event, x, P)
         if vision_filter is not None:
-            vision_filter.bias.bias_m = vision_filter.bias.bias_m + position_reset_m[event]
-            x, P = vision_filter.fuse(event, x, P, True, fusion_decisions.last_position_s)
+            vision_filter.bias.bias_m = vision_filter.bias.bias_m + positions.reset_m[event]
+            x, P = vision_filter.fuse(event, x, P, True, positions.decisions.last_position_s)
             # EKF2's timeout for a position reset also starts again when EKF2 fuses vision
             if inputs.rules.resets_velocity:
-                fusion_decisions.last_position_s = np.maximum(
-                    fusion_decisions.last_position_s, vision_filter.last_fusion_s
+                positions.decisions.last_position_s = np.maximum(
+                    positions.decisions.last_position_s, vision_filter.last_fusion_s
                 )
-        if height_filter is not None and not uses_logged_flag.all():
-            if has_sample[event] and has_velocity:
-                height_filter.update_records[event, -1, 0] = np.where(
-                    can_fuse_velocity[event], nu[:, VELOCITY_DOWN_COLUMN], np.nan
-                )
-                height_filter.update_records[event, -1, 1] = S[:, VELOCITY_DOWN_COLUMN]
-            height_filter.update_bad_acceleration_flag(event, event_time_s[event])
-        if is_bias_constant.any():
-            x[is_bias_constant, ACCELEROMETER_BIAS] = bias_before_fusion[is_bias_constant]
-            P[is_bias_constant, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = bias_covariance[
-                is_bias_constant
-            ]
-        states[event + 1] = x
-        state_variances[event + 1] = _get_state_variances(P)
-    innovations[~has_action] = np.nan
-    variances[~has_action] = np.nan
+        if height_filter is not None and not bad_acceleration_flag.uses_logged_flag.all():
+            height_filter.update_bad_acceleration_flag(
+                event, batch.event_time_s[event], positions.get_velocity_down_update(event)
+            )
+        # While EKF2 flags a bad acceleration, its accelerometer bias is constant
+        if is_accelerometer_bias_constant.any():
+            x[is_accelerometer_bias_constant, ACCELEROMETER_BIAS] = (
+                accelerometer_bias_before_fusion[is_accelerometer_bias_constant]
+            )
+            P[is_accelerometer_bias_constant, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = (
+                bias_covariance[is_accelerometer_bias_constant]
+            )
+        states[event + 1], state_variances[event + 1] = x, _get_state_variances(P)
+    positions.innovation[~positions.has_action] = np.nan
+    positions.innovation_variance[~positions.has_action] = np.nan
+    if vision_filter is not None:
+        positions.reset_m += vision_filter.position_reset_m
     return SegmentRun(
         segment,
         tuple(configurations),
-        tuple(interval_arrays.events for interval_arrays in intervals),
-        innovations,
-        variances,
-        measurement_variance.astype(np.float32),
-        is_rejected,
-        is_fused,
-        is_reset,
-        position_reset_m
-        if vision_filter is None
-        else position_reset_m + vision_filter.position_reset_m,
+        tuple(arrays.events for arrays in intervals),
+        positions.innovation,
+        positions.innovation_variance.astype(np.float32),
+        positions.measurement_variance.astype(np.float32),
+        positions.rejected,
+        positions.fused,
+        positions.reset,
+        positions.reset_m,
         states,
         state_variances,
         P,
@@ -572,29 +240,284 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     )
 
 
+class _Prediction:
+    """Prediction from one event to the next: x = Φx + u, P = ΦPΦ' + Q."""
+
+    def __init__(self, batch: FilterBatch, bad_acceleration_flag: BadAccelerationFlag) -> None:
+        self.batch, self.bad_acceleration_flag = batch, bad_acceleration_flag
+        self.step_counts = np.diff(batch.event_steps, axis=0, prepend=0)
+        self.acceleration_variance = np.tile(
+            batch.parameters["EKF2_ACC_NOISE"] ** 2, (len(self.step_counts), 1)
+        )
+        if (clipped_fraction := batch.segment.clipped_fraction) is not None:
+            # While an accelerometer clips, EKF2 uses BAD_ACCELERATION_NOISE_M_S2
+            clipped_fraction_sum_by_event = np.diff(
+                np.cumsum(clipped_fraction)[batch.event_steps],
+                axis=0,
+                prepend=clipped_fraction[0],
+            )
+            self.acceleration_variance += (
+                clipped_fraction_sum_by_event
+                / np.maximum(self.step_counts, 1)
+                * (BAD_ACCELERATION_NOISE_M_S2**2 - self.acceleration_variance)
+            )
+        self.bias_noise_per_step, self.max_variance_with_noise = _compute_bias_noise(batch)
+
+    def _prepare_transitions(self, events: slice) -> None:
+        """Compute Φ, u and Q of several events at once."""
+        batch = self.batch
+        transitions = {one: one.compute_transitions(events) for one in set(batch.intervals)}
+        (
+            self.transition,
+            state_change_by_attitude_correction,
+            state_change_by_acceleration,
+            gyro_noise_covariance,
+            self.accelerometer_noise_covariance,
+        ) = _stack_by_filter([transitions[one] for one in batch.intervals])
+        # Without attitude states, the attitude is EKF2's published attitude
+        self.state_change = (
+            state_change_by_acceleration
+            + batch.estimates_attitude[:, None] * state_change_by_attitude_correction
+        )
+        gyro_noise_variance = batch.estimates_attitude * batch.parameters["EKF2_GYR_NOISE"] ** 2
+        self.process_noise = (
+            gyro_noise_variance[:, None, None] * gyro_noise_covariance
+            + self.acceleration_variance[events, :, None, None]
+            * self.accelerometer_noise_covariance
+        )
+
+    def predict(self, event: int, x: Array, P: Array) -> None:
+        """Predict x and P at an event in place; call this method in order of events."""
+        row = event % EVENT_BATCH_SIZE
+        if row == 0:
+            self._prepare_transitions(slice(event, event + EVENT_BATCH_SIZE))
+        phi, time_s = self.transition[row], self.batch.event_time_s
+        x[:, :MOTION_STATE_COUNT] = (phi @ x[:, :STATE_COUNT, None])[:, :, 0]
+        x[:, :MOTION_STATE_COUNT] += self.state_change[row]
+        P[:, :MOTION_STATE_COUNT] = phi @ P[:, :STATE_COUNT]
+        P[:, :, :MOTION_STATE_COUNT] = P[:, :, :STATE_COUNT] @ np.swapaxes(phi, 1, 2)
+        motion_covariance = P[:, :MOTION_STATE_COUNT, :MOTION_STATE_COUNT]
+        motion_covariance += self.process_noise[row]
+        bad_acceleration_fraction = self.bad_acceleration_flag.compute_bad_acceleration_fraction(
+            time_s[event - 1] if event else self.batch.segment.time_s[:1], time_s[event]
+        )
+        if bad_acceleration_fraction.any():
+            variance_increase = bad_acceleration_fraction * (
+                BAD_ACCELERATION_NOISE_M_S2**2 - self.acceleration_variance[event]
+            )
+            motion_covariance += (
+                variance_increase[:, None, None] * self.accelerometer_noise_covariance[row]
+            )
+        variances = _get_state_variances(P)
+        variances += (variances < self.max_variance_with_noise) * (
+            self.bias_noise_per_step * self.step_counts[event, :, None]
+        )
+        if min_bias_variance := self.batch.inputs.rules.min_accelerometer_bias_variance_m2_s4:
+            _limit_bias_variance(P, min_bias_variance, self.batch.estimates_biases)
+
+
+def _compute_bias_noise(batch: FilterBatch) -> ArrayPair:
+    """Return process noise per prediction step, and maximum variance, of biases and fields.
+
+    The states are IMU biases and magnetic fields; the process noise of other states is zero. EKF2
+    adds no process noise to a state whose variance exceeds the maximum.
+    """
+    process_noise, max_variance = np.zeros((2, len(batch.configurations), len(batch.segment.state)))
+    sensors_and_states = [
+        ("GYR_B", "GYR", GYRO_BIAS, batch.estimates_attitude),
+        ("ACC_B", "ACC", ACCELEROMETER_BIAS, batch.estimates_biases),
+    ]
+    if batch.segment.magnetic_field is not None:
+        sensors_and_states += [
+            ("MAG_E", "MAG", EARTH_MAGNETIC_FIELD, True),
+            ("MAG_B", "MAG", BODY_MAGNETIC_FIELD, True),
+        ]
+    for bias_name, sensor_name, states, is_estimated in sensors_and_states:
+        noise_density = is_estimated * batch.parameters[f"EKF2_{bias_name}_NOISE"]
+        process_noise[:, states] = (noise_density * batch.inputs.mean_step_s)[:, None] ** 2
+        max_variance[:, states] = batch.parameters[f"EKF2_{sensor_name}_NOISE"][:, None] ** 2
+    return process_noise, max_variance
+
+
+class _PositionFusion:
+    """Fusion of the position source (velocity and position), and of logged height and heading.
+
+    Attributes
+    ----------
+    decisions : _FusionDecisions
+        State of the decisions on position samples.
+    measured_values, measurement_variance, innovation, innovation_variance : ndarray
+        z, R, ν and S of velocity and position (NED), shape (events, filters, 6).
+    rejected, fused, reset : ndarray of bool, shape (events, filters)
+        EKF2's decision on the position.
+    reset_m : ndarray, shape (events, filters, 2)
+        Change of the position by resets, north and east.
+    """
+
+    def __init__(self, batch: FilterBatch, bad_acceleration_flag: BadAccelerationFlag) -> None:
+        inputs, parameters, events = batch.inputs, batch.parameters, batch.events
+        self.has_velocity = inputs.received_positions.velocity_m_s is not None
+        self.batch, self.bad_acceleration_flag = batch, bad_acceleration_flag
+        action = np.where(batch.has_gate, events["action"], FUSE * events["usable"])
+        self.has_action = action > NO_ACTION
+        self.has_sample = np.any(self.has_action, axis=1).tolist()
+        self.can_fuse_velocity = (
+            (action == FUSE) & batch.is_enabled_by_aid[GNSS_VEL.name] & batch.fuses_velocity
+        )
+        position_gate = parameters[inputs.aid.gate]
+        gates = parameters.get(GNSS_VEL.gate, position_gate), position_gate
+        self.gate_squared = np.maximum(np.repeat(gates, 3, axis=0).T, MIN_INNOVATION_GATE) ** 2
+        self.measured_values, self.measurement_variance = _collect_measurements(batch)
+        self.decisions = _FusionDecisions(batch, action)
+        self.innovation, self.innovation_variance = np.full((2, *events.shape, 6), np.nan)
+        self.rejected, self.fused, self.reset = np.zeros((3, *events.shape), bool)
+        self.reset_m = np.zeros((*events.shape, 2))
+
+    def test_and_fuse_gnss(self, event: int, x: Array, P: Array) -> ArrayPair:
+        """Test the sample of an event with the gate, and fuse it if it is from GNSS."""
+        batch, R = self.batch, self.measurement_variance[event]
+        nu = self.measured_values[event] - x[:, VELOCITY_AND_POSITION]
+        S = _get_state_variances(P)[:, VELOCITY_AND_POSITION] + R
+        is_outside_gate = nu * nu > self.gate_squared * S
+        if is_outside_gate[:, VELOCITY_DOWN_COLUMN].any():
+            # With a bad vertical acceleration, EKF2 clips the vertical innovation to the gate
+            is_clipped = batch.has_gate & (
+                self.bad_acceleration_flag.until_s > batch.event_time_s[event]
+            )
+            is_clipped &= ~is_outside_gate[:, :VELOCITY_DOWN_COLUMN].any(axis=1)
+            limit = np.sqrt(self.gate_squared * S)[:, VELOCITY_DOWN_COLUMN]
+            velocity_down_innovation = nu[:, VELOCITY_DOWN_COLUMN]
+            np.clip(
+                velocity_down_innovation, -limit, limit, velocity_down_innovation, where=is_clipped
+            )
+            is_outside_gate[is_clipped, VELOCITY_DOWN_COLUMN] = False
+        self.innovation[event], self.innovation_variance[event] = nu, S
+        is_velocity_outside = is_outside_gate[:, VELOCITY_COLUMNS].any(axis=1)
+        self.rejected[event], self.fused[event], self.reset[event], is_velocity_fused = (
+            self.decisions.decide_fusion(
+                event,
+                is_outside_gate[:, HORIZONTAL_POSITION_COLUMNS].any(axis=1),
+                self.can_fuse_velocity[event] & ~(is_velocity_outside & batch.has_gate),
+            )
+        )
+        if batch.inputs.aid != GNSS_POS:
+            return x, P
+        if batch.segment.magnetic_field is None:
+            # Without a magnetometer, the tilt variance is set to its logged value
+            logged_variance = batch.segment.attitude_variance_rad2[batch.event_steps[event]]
+            for tilt_row in range(HEADING):
+                noise = _compute_noise_for_target_variance(
+                    P, tilt_row, logged_variance[:, tilt_row]
+                )
+                x, P = _fuse_states(x, P, [(tilt_row, x[:, tilt_row], noise)])
+        is_component_fused = np.repeat(
+            [is_velocity_fused & self.has_velocity, self.fused[event]], [3, 2], axis=0
+        ).T
+        return _update_sequentially(x, P, nu, S, R, is_component_fused)
+
+    def fuse_vision_and_logged_states(self, event: int, x: Array, P: Array) -> ArrayPair:
+        """Fuse external vision, and logged states that the model does not estimate.
+
+        Without a magnetometer, the heading is EKF2's logged heading. Without height measurements,
+        the height is EKF2's logged height. Their variances become the logged variances.
+        """
+        batch, segment = self.batch, self.batch.segment
+        steps = batch.event_steps[event]
+        is_heading_logged = segment.magnetic_field is None
+        heading_error_rad = batch.estimates_attitude * segment.attitude_error_rad[steps, HEADING]
+        logged_states = []
+        if is_heading_logged:
+            logged_variance = segment.attitude_variance_rad2[steps, HEADING]
+            logged_states.append((HEADING, heading_error_rad, logged_variance))
+        if segment.height_samples is None and not batch.inputs.fuses_vision_height:
+            logged_variance = segment.down_variance_m2[steps]
+            logged_states.append((POSITION_DOWN, segment.down_m[steps], logged_variance))
+        measurements = [
+            (row, value, _compute_noise_for_target_variance(P, row, logged_variance))
+            for row, value, logged_variance in logged_states
+        ]
+        if batch.inputs.aid != GNSS_POS and self.has_sample[event]:
+            is_fused = self.fused[event]
+            fused_states = [(POSITION_NORTH, is_fused), (POSITION_EAST, is_fused)]
+            if batch.inputs.fuses_vision_height:
+                fused_states.append((POSITION_DOWN, self.has_action[event]))
+            for row, is_fused in fused_states:
+                column = row - VELOCITY_AND_POSITION.start
+                noise = np.where(is_fused, self.measurement_variance[event, :, column], np.inf)
+                measurements.append((row, self.measured_values[event, :, column], noise))
+        x, P = _fuse_states(x, P, measurements)
+        if is_heading_logged:
+            x[:, HEADING] = heading_error_rad
+            P = 0.5 * (P + np.swapaxes(P, 1, 2))
+        elif segment.height_samples is None:
+            x[:, POSITION_DOWN] = segment.down_m[steps]
+        return x, P
+
+    def reset_states(self, event: int, x: Array, P: Array) -> None:
+        """Set the states of filters with a reset to the measurement, in place."""
+        rules, is_reset = self.batch.inputs.rules, self.reset[event]
+        resets = [(HORIZONTAL_POSITION, HORIZONTAL_POSITION_COLUMNS, rules.reset_variance_factor)]
+        if self.has_velocity and rules.resets_velocity:
+            resets.append((VELOCITY, VELOCITY_COLUMNS, 1.0))
+        for rows, columns, variance_factor in resets:
+            variance = variance_factor * self.measurement_variance[event, :, columns]
+            set_states(x, P, is_reset, rows, self.measured_values[event, :, columns], variance)
+        self.reset_m[event] = (
+            is_reset[:, None] * self.innovation[event, :, HORIZONTAL_POSITION_COLUMNS]
+        )
+
+    def get_velocity_down_update(self, event: int) -> Array:
+        """Return ν and S of the vertical velocity, shape (2, filters); NaN if it is not fused."""
+        update = [
+            values[event, :, VELOCITY_DOWN_COLUMN]
+            for values in (self.innovation, self.innovation_variance)
+        ]
+        return np.where(self.can_fuse_velocity[event], update, np.nan)
+
+
+def _average_samples(batch: FilterBatch, aid: Aid, samples: SensorSamples) -> EventSamples:
+    """Return the mean magnetometer or optical flow samples, shape (events, filters)."""
+    mean_samples = EventSamples(
+        *_stack_by_filter(
+            [average_by_event(batch.segment, samples, steps) for steps in batch.event_steps.T]
+        )
+    )
+    mean_samples.sample_count[:] *= batch.is_enabled_by_aid[aid.name]
+    if aid == MAG:
+        sigma_gauss = np.maximum(batch.parameters[MAG.noise], MIN_MAGNETOMETER_SIGMA_GAUSS)
+        mean_samples.noise[:] = sigma_gauss**2
+    return mean_samples
+
+
+def _make_bad_acceleration_flag(batch: FilterBatch) -> BadAccelerationFlag:
+    segment = batch.segment
+    uses_logged_flag = [
+        segment.height_samples is None
+        or segment.is_acceleration_bad is None
+        or configuration.can_use_logged_bad_acceleration_flag(batch.inputs)
+        for configuration in batch.configurations
+    ]
+    return BadAccelerationFlag(
+        np.array(uses_logged_flag), batch.inputs.rules.bad_acceleration_flag_duration_s, segment
+    )
+
+
 def _stack_by_filter(tuples_by_filter: Sequence[tuple[Array, ...]]) -> list[Array]:
     """Stack the arrays of all filters along axis 1."""
     return [np.stack(arrays, axis=1) for arrays in zip(*tuples_by_filter, strict=True)]
 
 
-def _update_jointly(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPair:
-    """Fuse all measurements together: K = PH'(HPH' + R)⁻¹, x = x + Kν, P = P - KHP."""
-    HP = P.take(STATES_FUSED_IN_ONE_UPDATE, axis=1)
-    S = HP.take(STATES_FUSED_IN_ONE_UPDATE, axis=2)
-    S_diagonal = _get_state_variances(S)
-    S_diagonal += R
-    K = np.swapaxes(HP, 1, 2) @ np.linalg.inv(S)
-    x = x + (K @ innovation[:, :, None])[:, :, 0]
-    P = P - K @ HP
-    return x, 0.5 * (P + np.swapaxes(P, 1, 2))
+def _fuse_states(x: Array, P: Array, measurements: Sequence[tuple[int, Array, Array]]) -> ArrayPair:
+    """Fuse measurements of single states: K = PH'/(HPH' + R), x = x + Kν, P = P - KHP.
 
-
-def _update_to_variance(P: Array, state_index: int, target_variance: Array) -> ArrayPair:
-    """Return gain and covariance of an update after which a state has ``target_variance``."""
-    state_variance = P[:, state_index, state_index]
-    R = _compute_noise_for_target_variance(state_variance, target_variance)
-    K = P[:, :, state_index] / (state_variance + R)[:, None]
-    return K, P - K[:, :, None] * P[:, None, state_index]
+    Each measurement consists of state index, value and R. With infinite R, it has no effect.
+    """
+    for row, value, R in measurements:
+        HP = P[:, row]
+        K = HP / (HP[:, row] + R)[:, None]
+        x = x + K * (value - x[:, row])[:, None]
+        P = P - K[:, :, None] * HP[:, None]
+    return x, P
 
 
 def _update_sequentially(
@@ -603,58 +526,61 @@ def _update_sequentially(
     """Fuse velocity and horizontal position, one component after the other; return x and P.
 
     All innovations ν and variances S are from before the first update (fuseDirectStateMeasurement,
-    ``ekf_helper.cpp``). P is updated in Joseph form.
+    ``ekf_helper.cpp``), so the gain K = c/S is not optimal. With the column c = PH' of P and
+    h = HPH', the Joseph form of an update is
+
+        P - cK' - Kc' + K (h + R) K' = P - b cc',  b = (2 - (h + R)/S) / S
     """
     component_count = is_fused.shape[1]
     # Components that are not fused may be NaN: replace them by 1
     nu, S, R = np.where(is_fused, np.array([nu, S, R])[:, :, :component_count], 1.0)
-    fused_inverse_variance = is_fused / S
-    inverse_variance_squared = fused_inverse_variance * fused_inverse_variance
-    b = 2.0 * fused_inverse_variance - inverse_variance_squared * R
-    rows = slice(VELOCITY.start, VELOCITY.start + component_count)
-    columns = P[:, rows].copy()
-    for j in range(component_count):
-        column = columns[:, j : j + 1]
-        measurement_covariance = columns[:, j, rows]
-        b[:, j] -= inverse_variance_squared[:, j] * measurement_covariance[:, j]
-        factor = b[:, j, None] * measurement_covariance[:, j + 1 :]
-        columns[:, j + 1 :] -= factor[:, :, None] * column
-    x = x + ((fused_inverse_variance * nu)[:, None] @ columns)[:, 0]
-    covariance_reduction_factor = np.sqrt(b)[:, :, None] * columns
-    return x, P - np.swapaxes(covariance_reduction_factor, 1, 2) @ covariance_reduction_factor
+    inverse_S = is_fused / S
+    for column in range(component_count):
+        row = VELOCITY.start + column
+        c, gain = P[:, row], inverse_S[:, column]
+        b = gain * (2.0 - gain * (c[:, row] + R[:, column]))
+        x = x + c * (gain * nu[:, column])[:, None]
+        P = P - (b[:, None] * c)[:, :, None] * c[:, None]
+    return x, P
 
 
-@dataclass
 class _FusionDecisions:
     """Decisions on each position sample: reject it, fuse it, or reset the position to it.
 
     EKF2 resets the position after a time without fusion. After several resets, EKF2 stops fusion.
 
     Source: updateEvPosFusion, startEvPosFusion (``ev_pos_control.cpp``).
+
+    Parameters
+    ----------
+    action : ndarray of int, shape (events, filters)
+        Action of each filter on the sample if it is inside the gate.
+
+    Attributes
+    ----------
+    logged_rejected_flags, logged_resets : ndarray, shape (events,)
+        EKF2's logged decisions; NaN for an unknown rejection.
+    last_position_s, last_velocity_s : ndarray, shape (filters,)
+        Time of the last fusion or reset.
     """
 
-    fusion_rules: FusionRules
-    start_s: float
-    sample_actions: IntArray
-    can_start_fusion: BoolArray
-    time_s: Array
-    has_gate: BoolArray
-    uses_logged_decisions: BoolArray
-    logged_rejected_flags: Array
-    logged_resets: BoolArray
-    is_every_reset_logged: bool
-
-    def __post_init__(self) -> None:
-        configuration_count = len(self.has_gate)
-        self.last_position_s, self.last_velocity_s = np.full((2, configuration_count), self.start_s)
-        self.is_stopped = np.zeros(configuration_count, bool)
-        self.remaining_resets = np.full(configuration_count, self.fusion_rules.max_resets)
-        # Without a logged start of fusion, reset or rejection, only the gate decides on a sample
-        self.only_gate_decides = (
-            (self.sample_actions == FUSE).all(axis=1)
-            & ~self.logged_resets
-            & ~(self.logged_rejected_flags > 0.0)
+    def __init__(self, batch: FilterBatch, action: IntArray) -> None:
+        received_positions, events = batch.inputs.received_positions, batch.events
+        is_aid_enabled = batch.is_enabled_by_aid[batch.inputs.aid.name]
+        self.fusion_rules, self.time_s = batch.inputs.rules, batch.event_time_s
+        self.sample_actions = np.where(is_aid_enabled, action, NO_ACTION)
+        self.can_start_fusion = events["can_start_fusion"] & is_aid_enabled
+        self.has_gate, self.uses_logged_decisions = batch.has_gate, batch.uses_logged_decisions
+        # All filters receive the same samples
+        samples = np.maximum(events["sample"][:, 0], 0)
+        self.logged_rejected_flags = received_positions.rejected_flags[samples]
+        self.logged_resets = received_positions.is_reset_to_sample[samples]
+        self.is_every_reset_logged = received_positions.is_every_reset_logged
+        self.last_position_s, self.last_velocity_s = np.full(
+            (2, events.shape[1]), batch.segment.time_s[0]
         )
+        self.is_stopped = np.zeros(events.shape[1], bool)
+        self.remaining_resets = np.full(events.shape[1], self.fusion_rules.max_resets)
 
     def decide_fusion(
         self, event: int, is_outside_gate: BoolArray, is_velocity_fused: BoolArray
@@ -663,48 +589,26 @@ class _FusionDecisions:
 
         Return four masks: position rejected, position fused, position reset, velocity fused.
         """
-        fusion_rules, uses_logged_decisions = self.fusion_rules, self.uses_logged_decisions
-        now_s, action, is_reset_logged = (
-            values[event] for values in (self.time_s, self.sample_actions, self.logged_resets)
-        )
-        may_fuse = action == FUSE
-        is_decision_logged = math.isfinite(self.logged_rejected_flags[event])
+        now_s, action = self.time_s[event], self.sample_actions[event]
+        is_reset_logged = self.logged_resets[event]
         self.last_velocity_s = np.where(is_velocity_fused, now_s, self.last_velocity_s)
-        if self.only_gate_decides[event] and not (is_outside_gate.any() or self.is_stopped.any()):
-            self.last_position_s = now_s
-            return is_outside_gate, may_fuse, is_outside_gate, is_velocity_fused
-        is_rejected = np.where(
-            uses_logged_decisions & is_decision_logged,
-            self.logged_rejected_flags[event] > 0.0,
-            is_outside_gate,
-        )
-        is_rejected &= self.has_gate & may_fuse
-        if self.is_every_reset_logged and not is_decision_logged:
-            # If EKF2 had rejected this sample, its timeout would end before the next sample and
-            # reset the position. Without a logged reset at the next sample, EKF2 has fused this
-            # sample
-            next_event = min(event + 1, len(self.time_s) - 1)
-            is_rejected &= ~(
-                uses_logged_decisions
-                & (self.time_s[next_event] - self.last_position_s > fusion_rules.reset_timeout_s)
-                & ~self.logged_resets[next_event]
-            )
+        may_fuse = action == FUSE
+        is_rejected = self.has_gate & may_fuse & self._find_rejected(event, is_outside_gate)
         is_fusion_starting = self.has_gate & (
             (action == START_FUSION) | (self.is_stopped & self.can_start_fusion[event])
         )
-        time_since_fusion_s = now_s - self.last_position_s
+        if not (is_reset_logged or (is_rejected | self.is_stopped | is_fusion_starting).any()):
+            # This is the case for most samples
+            self.last_position_s = np.where(may_fuse, now_s, self.last_position_s)
+            return is_rejected, may_fuse, np.zeros_like(may_fuse), is_velocity_fused
+        uses_logged_resets = self.uses_logged_decisions & (
+            self.is_every_reset_logged
+            or is_reset_logged
+            or not math.isnan(self.logged_rejected_flags[event])
+        )
         is_rejection_timed_out = (
-            is_rejected & ~self.is_stopped & (time_since_fusion_s > fusion_rules.reset_timeout_s)
+            is_rejected & ~self.is_stopped & ~uses_logged_resets & self._is_timed_out(now_s)
         )
-        if fusion_rules.resets_velocity:
-            is_velocity_timed_out = now_s - self.last_velocity_s > fusion_rules.reset_timeout_s
-            is_rejection_timed_out &= is_velocity_timed_out | (
-                time_since_fusion_s > 2.0 * fusion_rules.reset_timeout_s
-            )
-        uses_logged_resets = uses_logged_decisions & (
-            is_decision_logged or is_reset_logged or self.is_every_reset_logged
-        )
-        is_rejection_timed_out &= ~uses_logged_resets
         is_reset_after_timeout = is_rejection_timed_out & (self.remaining_resets > 0)
         is_reset = np.where(
             uses_logged_resets,
@@ -714,37 +618,44 @@ class _FusionDecisions:
         is_fused = may_fuse & ~(is_rejected | self.is_stopped | is_reset)
         self.last_position_s = np.where(is_fused | is_reset, now_s, self.last_position_s)
         self.last_velocity_s = np.where(is_reset, now_s, self.last_velocity_s)
+        # EKF2 stops fusion if the rejections time out after the last allowed reset
         self.is_stopped = (self.is_stopped & ~is_fusion_starting) | (
             is_rejection_timed_out & ~is_reset_after_timeout
         )
         self.remaining_resets = np.where(
             is_fusion_starting,
-            fusion_rules.max_resets,
+            self.fusion_rules.max_resets,
             self.remaining_resets - is_reset_after_timeout,
         )
         return is_rejected, is_fused, is_reset, is_velocity_fused & ~is_reset
 
+    def _find_rejected(self, event: int, is_outside_gate: BoolArray) -> BoolArray:
+        """Return True for filters that reject the sample, by the log or by the gate."""
+        logged_flag = self.logged_rejected_flags[event]
+        if not math.isnan(logged_flag):
+            return np.asarray(
+                np.where(self.uses_logged_decisions, logged_flag > 0.0, is_outside_gate)
+            )
+        if not self.is_every_reset_logged:
+            return is_outside_gate
+        # If EKF2 had rejected this sample, its timeout would end before the next sample and reset
+        # the position. Without a logged reset at the next sample, EKF2 has fused this sample
+        next_event = min(event + 1, len(self.time_s) - 1)
+        would_be_reset = (
+            self.time_s[next_event] - self.last_position_s > self.fusion_rules.reset_timeout_s
+        )
+        is_fused_in_log = (
+            self.uses_logged_decisions & would_be_reset & ~self.logged_resets[next_event]
+        )
+        return np.asarray(is_outside_gate & ~is_fused_in_log)
 
-def _compute_variance_growth(
-    inputs: ReplayInputs,
-    segment: ReplaySegment,
-    parameters: dict[str, Array],
-    estimates_biases: BoolArray,
-    estimates_attitude: BoolArray,
-) -> ArrayPair:
-    """Return process noise per prediction step, and maximum variance, of biases and fields.
-
-    The states are IMU biases and magnetic fields. EKF2 adds no process noise to a state whose
-    variance exceeds the maximum.
-    """
-    vector_count = 2 if segment.magnetic_field is None else 4
-    noise_density, max_sigma_with_process_noise = (
-        np.repeat([parameters[f"EKF2_{name}_NOISE"] for name in names[:vector_count]], 3, axis=0).T
-        for names in (("GYR_B", "ACC_B", "MAG_E", "MAG_B"), ("GYR", "ACC", "MAG", "MAG"))
-    )
-    noise_density[:, :3] *= estimates_attitude[:, None]
-    noise_density[:, 3:6] *= estimates_biases[:, None]
-    return (noise_density * inputs.mean_step_s) ** 2, max_sigma_with_process_noise**2
+    def _is_timed_out(self, now_s: Array) -> BoolArray:
+        """Return True for filters that reset the position at the next rejection."""
+        fusion_rules = self.fusion_rules
+        # Releases that reset velocity and position together wait longer while velocity is fused
+        is_velocity_fused = now_s - self.last_velocity_s <= fusion_rules.reset_timeout_s
+        factor = np.where(fusion_rules.resets_velocity & is_velocity_fused, 2.0, 1.0)
+        return np.asarray(now_s - self.last_position_s > factor * fusion_rules.reset_timeout_s)
 
 
 def estimate_state_correlation(inputs: ReplayInputs, segment: ReplaySegment) -> ReplaySegment:
@@ -752,20 +663,17 @@ def estimate_state_correlation(inputs: ReplayInputs, segment: ReplaySegment) -> 
 
     The log contains only the variances.
     """
-    initial_state_correlation = _compute_steady_state_correlation(segment)
-    if preceding_segment := segment.preceding_segment:
+    first_segment = segment.preceding_segment or segment
+    initial_state_correlation = _compute_steady_state_correlation(first_segment)
+    if first_segment is not segment:
         inputs = replace(inputs, vision_positions=None)
         configuration = FilterConfiguration(inputs.settings)
-        preceding_segment = replace(
-            preceding_segment,
-            initial_state_correlation=_compute_steady_state_correlation(preceding_segment),
-        )
+        first_segment = replace(first_segment, initial_state_correlation=initial_state_correlation)
         intervals = make_event_intervals(
-            inputs, preceding_segment, configuration.compute_delays(inputs)
+            inputs, first_segment, configuration.compute_delays(inputs)
         )
-        initial_state_correlation = _compute_correlation(
-            run_segment(inputs, preceding_segment, [configuration], [intervals]).covariance[0]
-        )
+        run = run_segment(inputs, first_segment, [configuration], [intervals])
+        initial_state_correlation = _compute_correlation(run.covariance[0])
     if segment.magnetic_field is not None:
         # EKF2 has just reset heading and magnetic fields, so they are uncorrelated
         initial_state_correlation = block_diag(
@@ -793,21 +701,18 @@ def _compute_steady_state_correlation(segment: ReplaySegment) -> Array:
     """
     state_rotation_to_ned = np.eye(STATE_COUNT)
     state_rotation_to_ned[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = segment.body_to_ned[0]
-    P = np.diag(
-        np.diagonal(
-            state_rotation_to_ned
-            @ np.diag(segment.variance[:STATE_COUNT])
-            @ state_rotation_to_ned.T
-        )
-    )
+    P = np.diag(state_rotation_to_ned**2 @ segment.variance[:STATE_COUNT])
+    # A tilt about north accelerates the vehicle to the east, a tilt about east to the south
     for tilt_state, bias_state, acceleration_per_rad in (
         (1, ACCELEROMETER_BIAS_NORTH, -GRAVITY_MAGNITUDE_M_S2),
         (0, ACCELEROMETER_BIAS_EAST, GRAVITY_MAGNITUDE_M_S2),
     ):
-        P[tilt_state, bias_state] = P[bias_state, tilt_state] = (
-            min(P[tilt_state, tilt_state] * acceleration_per_rad**2, P[bias_state, bias_state])
-            / acceleration_per_rad
+        # The smaller of the two acceleration variances is common to both errors
+        common_variance = min(
+            P[tilt_state, tilt_state] * acceleration_per_rad**2, P[bias_state, bias_state]
         )
+        P[tilt_state, bias_state] = common_variance / acceleration_per_rad
+        P[bias_state, tilt_state] = P[tilt_state, bias_state]
     return _compute_correlation(state_rotation_to_ned.T @ P @ state_rotation_to_ned)
 
 
@@ -816,38 +721,48 @@ def _get_state_variances(P: Array) -> Array:
     return P.reshape(len(P), -1)[:, :: P.shape[1] + 1]
 
 
-def _make_start_state(
-    segment: ReplaySegment, estimates_biases: BoolArray, estimates_attitude: BoolArray
-) -> ArrayPair:
-    x = np.tile(segment.state, (len(estimates_biases), 1))
+def _make_start_state(batch: FilterBatch, bad_acceleration_flag: BadAccelerationFlag) -> ArrayPair:
+    segment, filter_count = batch.segment, len(batch.configurations)
+    x = np.tile(segment.state, (filter_count, 1))
     sigma = np.sqrt(segment.variance)
-    P = np.tile(
-        sigma[:, None] * segment.initial_state_correlation * sigma, (len(estimates_biases), 1, 1)
-    )
-    for rows, is_estimated in (
-        (THETA, estimates_attitude),
-        (GYRO_BIAS, estimates_attitude),
-        (ACCELEROMETER_BIAS, estimates_biases),
+    P = np.tile(sigma[:, None] * segment.initial_state_correlation * sigma, (filter_count, 1, 1))
+    zeros = np.zeros((filter_count, 3))
+    # Without the bias states, the accelerometer bias is zero: bias error = -nominal bias
+    bias_error_m_s2 = zeros - segment.accelerometer_bias_m_s2
+    for rows, is_estimated, value in (
+        (THETA, batch.estimates_attitude, zeros),
+        (GYRO_BIAS, batch.estimates_attitude, zeros),
+        (ACCELEROMETER_BIAS, batch.estimates_biases, bias_error_m_s2),
     ):
-        set_states(x, P, ~is_estimated, rows, *np.zeros((2, len(x), 3)))
-    x[~estimates_biases, ACCELEROMETER_BIAS] = -segment.accelerometer_bias_m_s2
+        set_states(x, P, ~is_estimated, rows, value, zeros)
+    # While EKF2 flags a bad acceleration, the log contains no accelerometer bias. Start with the
+    # mean vertical bias of the segment
+    is_bias_unknown = (
+        (bad_acceleration_flag.until_s > segment.time_s[0])
+        & ~bad_acceleration_flag.uses_logged_flag
+        & batch.estimates_biases
+    )
+    set_states(
+        x,
+        P,
+        is_bias_unknown,
+        slice(ACCELEROMETER_BIAS_DOWN, ACCELEROMETER_BIAS_DOWN + 1),
+        np.full((filter_count, 1), segment.mean_bias_down_m_s2),
+        np.full((filter_count, 1), INITIAL_BIAS_SIGMA_M_S2**2),
+    )
     return x, P
 
 
-def _compute_noise_for_target_variance(variance: Array, target_variance: Array) -> Array:
-    """Return the R of an update that changes ``variance`` to ``target_variance``.
+def _compute_noise_for_target_variance(P: Array, row: int, target_variance: Array) -> Array:
+    """Return the R of an update that changes the variance of a state to ``target_variance``.
 
-    1/R = 1/target_variance - 1/variance.
+    1/R = 1/target_variance - 1/variance. R is infinite if the variance is already smaller.
     """
+    variance = P[:, row, row]
     excess_variance = variance - target_variance
-    required_noise_variance = np.full(excess_variance.shape, VARIANCE_WITHOUT_EFFECT)
-    np.divide(
-        variance * target_variance,
-        excess_variance,
-        out=required_noise_variance,
-        where=excess_variance > 0.0,
-    )
-    return required_noise_variance
+    noise = np.full(len(P), np.inf)
+    np.divide(variance * target_variance, excess_variance, noise, where=excess_variance > 0.0)
+    return noise
 
 
 def _limit_bias_variance(P: Array, lower_limit_m2_s4: float, estimates_biases: BoolArray) -> None:
@@ -862,55 +777,49 @@ def _limit_bias_variance(P: Array, lower_limit_m2_s4: float, estimates_biases: B
     )[estimates_biases]
 
 
-def _collect_measurements(
-    inputs: ReplayInputs,
-    segment: ReplaySegment,
-    sample_indices: IntArray,
-    event_steps: IntArray,
-    parameters: dict[str, Array],
-    uses_reported_noise: BoolArray,
-) -> ArrayPair:
+def _collect_measurements(batch: FilterBatch) -> ArrayPair:
     """Return measurements and variances, shape (events, filters, 6): velocity, position (NED)."""
-    received_positions, aid = inputs.received_positions, inputs.aid
+    inputs, segment, parameters = batch.inputs, batch.segment, batch.parameters
+    received_positions, aid, event_steps = inputs.received_positions, inputs.aid, batch.event_steps
+    samples = np.maximum(batch.events["sample"], 0)
     sensor_offset_m = (
-        np.stack([parameters[name] for name in aid.lever_arm], -1) - inputs.imu_offset_m
-    )[:, :, None]
-    measured_values, measurement_variance = np.full(
-        (2, len(event_steps), len(sensor_offset_m), 6), np.nan
+        np.stack([parameters[name] for name in aid.lever_arm], axis=-1) - inputs.imu_offset_m
     )
+    measured_values, measurement_variance = np.full((2, *event_steps.shape, 6), np.nan)
+
+    def rotate_offset(body_to_ned: Array) -> Array:
+        return np.asarray((body_to_ned @ sensor_offset_m[:, :, None])[..., 0])
 
     def limit_variance(reported_variance: Array, noise_parameter: str) -> Array:
         min_sigma = np.maximum(parameters[noise_parameter], MIN_MEASUREMENT_NOISE_SIGMA)
         return np.asarray(np.maximum(reported_variance, min_sigma[:, None] ** 2))
 
     body_to_ned = segment.body_to_ned[event_steps]
-    measured_values[..., 3:] = (
-        received_positions.position_m[sample_indices][:, None]
-        - (body_to_ned @ sensor_offset_m)[..., 0]
-    )
+    measured_values[..., 3:] = received_positions.position_m[samples] - rotate_offset(body_to_ned)
+    uses_reported_noise = batch.uses_reported_noise
     if aid.noise_mode_parameter:
         uses_reported_noise = uses_reported_noise & (parameters[aid.noise_mode_parameter] != 1.0)
     measurement_variance[..., 3:] = limit_variance(
-        received_positions.variance_m2[sample_indices][:, None] * uses_reported_noise[:, None],
-        aid.noise,
+        received_positions.variance_m2[samples] * uses_reported_noise[:, None], aid.noise
     )
     if (
         received_positions.velocity_m_s is not None
         and received_positions.velocity_variance_m2_s2 is not None
     ):
         # Velocity of the antenna relative to the rotating IMU: dR/dt · lever arm
+        previous_steps = event_steps - 1
         rotation_matrix_derivative_per_s = (
-            body_to_ned - segment.body_to_ned[event_steps - 1]
-        ) / segment.step_s[event_steps - 1, None, None]
-        measured_values[..., :3] = (
-            received_positions.velocity_m_s[sample_indices][:, None]
-            - (rotation_matrix_derivative_per_s @ sensor_offset_m)[..., 0]
+            body_to_ned - segment.body_to_ned[previous_steps]
+        ) / segment.step_s[previous_steps, None, None]
+        measured_values[..., :3] = received_positions.velocity_m_s[samples] - rotate_offset(
+            rotation_matrix_derivative_per_s
         )
         measurement_variance[..., :3] = GNSS_VELOCITY_VARIANCE_FACTORS * limit_variance(
-            received_positions.velocity_variance_m2_s2[sample_indices][:, None], GNSS_VEL.noise
+            received_positions.velocity_variance_m2_s2[samples], GNSS_VEL.noise
         )
     if aid == GNSS_POS:
-        measurement_variance[..., 5] = np.maximum(
-            measurement_variance[..., 5], (GNSS_HEIGHT_NOISE_FACTOR * parameters[aid.noise]) ** 2
+        measurement_variance[..., DOWN_COLUMN] = np.maximum(
+            measurement_variance[..., DOWN_COLUMN],
+            (GNSS_HEIGHT_NOISE_FACTOR * parameters[aid.noise]) ** 2,
         )
     return measured_values, measurement_variance

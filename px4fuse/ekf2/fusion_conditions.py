@@ -155,9 +155,14 @@ def find_unmet_condition(positions: UnfusedPositions) -> UnmetCondition:
 def _check_enabling_parameter(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     parameter_name, bit = positions.aid.switch, 0
     if not positions.has_enabling_parameter:
-        parameter_name, bit = AID_MASK_PARAMETER, 3 if positions.is_vision else 0
-    parameter_value = int(positions.parameters.get(parameter_name, 1 << bit))
-    if parameter_value >> bit & 1:
+        # Before PX4 v1.14, one bit mask enables all sources: bit 0 GNSS, bit 3 vision
+        parameter_name = AID_MASK_PARAMETER
+        if positions.is_vision:
+            bit = 3
+    bit_value = 1 << bit
+    # Without the parameter in the log, the source is assumed to be enabled
+    parameter_value = int(positions.parameters.get(parameter_name, bit_value))
+    if parameter_value & bit_value:
         return
     fused_quantity_name = (
         "horizontal position"
@@ -167,14 +172,15 @@ def _check_enabling_parameter(positions: UnfusedPositions) -> Iterator[UnmetCond
     reason = (
         f"Fusion of {fused_quantity_name} is disabled: bit {bit} of {parameter_name} is not set."
     )
-    action = f"Set {parameter_name} to {parameter_value | 1 << bit}."
+    action = f"Set {parameter_name} to {parameter_value | bit_value}."
+    # Such a source cannot be fused as a position: the parameter is correct
     if is_height_only(positions.source):
         reason = f"The source contains no horizontal position: x and y are constant. {reason}"
         action = f"Leave bit {bit} of {parameter_name} unset."
     yield UnmetCondition("switch", f"{parameter_name} is {parameter_value}", reason, action)
 
 
-def constant_coordinates(source: PositionTrack) -> list[str]:
+def find_constant_coordinates(source: PositionTrack) -> list[str]:
     """Return the names of the coordinates (x, y, z) that are constant in all positions."""
     ranges_m = np.ptp(source.samples[Columns.POSITION].to_numpy(), axis=0)
     is_constant = ranges_m < MIN_RANGE_OF_MEASURED_COORDINATE_M
@@ -183,7 +189,7 @@ def constant_coordinates(source: PositionTrack) -> list[str]:
 
 def is_height_only(source: PositionTrack) -> bool:
     """Return True if a position source measures only the height: x and y are constant."""
-    return {"x", "y"} <= {*constant_coordinates(source)}
+    return {"x", "y"} <= {*find_constant_coordinates(source)}
 
 
 def _check_position_frame(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
@@ -262,7 +268,7 @@ def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
         )
 
 
-def _check_quality(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
+def _check_position_quality(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     """Yield an unmet condition of fusion if the quality of the positions is too small.
 
     EKF2 fuses positions only if several successive positions have a quality of at least
@@ -401,7 +407,7 @@ VISION_FUSION_CHECKS = (
     _check_position_frame,
     _check_position_gap,
     _check_timestamps,
-    _check_quality,
+    _check_position_quality,
     _check_interval,
     _check_alignment,
     _check_gate,

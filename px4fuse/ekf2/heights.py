@@ -12,44 +12,25 @@ Sources: PX4-Autopilot ``EKF/aid_sources`` (``barometer/baro_height_control.cpp`
 ``EKF/gnss_height_control.cpp``.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
-from px4fuse.ekf2.barometer import find_fused_barometer_samples
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray
 from px4fuse.ekf2.bias import BiasEstimator
+from px4fuse.ekf2.filter_batch import FilterBatch
+from px4fuse.ekf2.height_samples import HEIGHT_SENSORS, POSITION_DOWN
 from px4fuse.ekf2.replay_segments import (
-    HeightSamples,
     ReplaySegment,
-    find_sample_steps,
     group_samples_by_event,
     make_update_table,
     stack_samples,
 )
-from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, GNSS_HGT, Aid, uses_aid_mask
-from px4fuse.flight.model import (
-    GROUND_EFFECT_FLAG,
-    Ekf2,
-    Flight,
-    FusionRecord,
-    sample_step_function,
-)
+from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_HGT, Aid
 
-# State indices of vertical velocity and height
-VELOCITY_DOWN, POSITION_DOWN = 5, 8
-HEIGHT_SENSORS = (BAROMETER, GNSS_HGT)
-HEIGHT_AIDS = (*HEIGHT_SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
-# Default (m) of EKF2_GND_EFF_DZ, the barometer's dead zone near the ground
-DEFAULT_GROUND_EFFECT_DEAD_ZONE_M = 4.0
-# PX4's name of the height reference, by value of EKF2_HGT_REF
-HEIGHT_AID_BY_REFERENCE = {0: BAROMETER.name, 1: GNSS_HGT.name}
-# Maximum time (s) from the start of the replay to the first logged height bias
-MAX_BIAS_LOG_DELAY_S = 1.0
-# Minimum logging rate (Hz) of the barometer for a replay of its fusion
-MIN_BAROMETER_LOG_HZ = 4.0
+# Index of the vertical axis in NED
+DOWN_AXIS = slice(2, 3)
+# State index of the vertical velocity
+VELOCITY_DOWN = 5
 # Minimum innovation gate (√S) that EKF2 uses
 MIN_INNOVATION_GATE = 1.0
 # Minimum σ of the measurement noise that EKF2 uses: position (m) or velocity (m/s)
@@ -58,83 +39,10 @@ MIN_MEASUREMENT_NOISE_SIGMA = 0.01
 GNSS_HEIGHT_NOISE_FACTOR = 1.5
 # EKF2 flags a bad acceleration if height innovations are too large: that of barometer or GNSS must
 # exceed this multiple of √S (vert_innov_test_lim, common.h)
-MIN_HEIGHT_INNOVATION_OF_ONE_SENSOR = 3.0
+MIN_HEIGHT_INNOVATION_SIGMAS_OF_ONE_SENSOR = 3.0
 # For a bad-acceleration flag, the height innovations of both barometer and GNSS must exceed this
 # multiple of √S (vert_innov_test_min, common.h)
-MIN_HEIGHT_INNOVATION_OF_BOTH_SENSORS = 1.0
-
-
-def add_heights(
-    flight: Flight, ekf2: Ekf2, fusion_record: FusionRecord, segments: Sequence[ReplaySegment]
-) -> tuple[ReplaySegment, ...] | str:
-    """Add height measurements to the replay, or return the reason why this is impossible."""
-    parameters = fusion_record.parameters
-    replayed_times_s = np.concatenate([segment.time_s for segment in segments])
-    if uses_aid_mask(parameters):
-        return "EKF2 before PX4 v1.14 fuses only one height sensor"
-    enabled_fractions = {
-        name: np.mean(sample_step_function(aid_log.enabled, replayed_times_s) > 0.0)
-        for name, aid_log in ekf2.aids.items()
-        if aid_log.enabled is not None
-    }
-    fused_aids = [aid.name for aid in HEIGHT_SENSORS if enabled_fractions.get(aid.name) == 1.0]
-    for aid in HEIGHT_AIDS:
-        if enabled_fractions.get(aid.name) and aid.name not in fused_aids:
-            return f"EKF2 also fused {aid.label} in part of the flight"
-    reference = HEIGHT_AID_BY_REFERENCE.get(int(parameters.get("EKF2_HGT_REF", 1.0)))
-    # A single height sensor is the height reference
-    if len(fused_aids) == 1:
-        (reference,) = fused_aids
-    if reference not in fused_aids:
-        return "EKF2's height reference is neither GNSS nor barometer, or not logged"
-    barometer_samples = pd.DataFrame(columns=["down_m", "weight"], dtype=float)
-    if BAROMETER.name in fused_aids and flight.barometer is not None:
-        barometer_down_m = flight.barometer["down_m"]
-        barometer_down_m = barometer_down_m.set_axis(barometer_down_m.index - 0.5 * ekf2.step_s)
-        barometer_samples = find_fused_barometer_samples(ekf2, fusion_record, barometer_down_m)
-    barometer_samples["down_m"] += fusion_record.altitude_m
-    sample_times_s = barometer_samples.index.to_numpy(float)
-    barometer_samples["dead_zone_m"] = fusion_record.was_flag_set(
-        GROUND_EFFECT_FLAG, sample_times_s
-    ) * parameters.get("EKF2_GND_EFF_DZ", DEFAULT_GROUND_EFFECT_DEAD_ZONE_M)
-    segments_with_heights = []
-    delayed_down_m = fusion_record.delayed_state["down_m"]
-    for segment in segments:
-        start_s = float(segment.time_s[0])
-        bias_and_variance = np.zeros(2)
-        for aid_name in {*fused_aids} - {reference}:
-            logged_bias = fusion_record.height_bias_updates.get(aid_name)
-            if (
-                logged_bias is None
-                or not logged_bias.index[0] - MAX_BIAS_LOG_DELAY_S < start_s < logged_bias.index[-1]
-            ):
-                return f"EKF2's estimate of the {AIDS[aid_name].label} bias is not logged"
-            bias_and_variance = np.array(
-                [
-                    np.interp(start_s, logged_bias.index, logged_bias[name])
-                    for name in ("bias_m", "bias_m2")
-                ]
-            )
-        step_indices, is_inside = find_sample_steps(segment, sample_times_s)
-        rate_hz = len(step_indices) / (segment.time_s[-1] - start_s)
-        if BAROMETER.name in fused_aids and rate_hz < MIN_BAROMETER_LOG_HZ:
-            return (
-                f"the barometer is logged at {rate_hz:.1f} Hz; a replay of its fusion needs "
-                f"{MIN_BAROMETER_LOG_HZ:g} Hz"
-            )
-        initial_state = segment.state.copy()
-        initial_state[POSITION_DOWN] = np.interp(start_s, delayed_down_m.index, delayed_down_m)
-        height_samples = HeightSamples(
-            tuple(fused_aids),
-            reference,
-            bias_and_variance,
-            step_indices,
-            barometer_samples[is_inside],
-        )
-        segments_with_heights.append(
-            replace(segment, state=initial_state, height_samples=height_samples)
-        )
-    return tuple(segments_with_heights)
+MIN_HEIGHT_INNOVATION_SIGMAS_OF_BOTH_SENSORS = 1.0
 
 
 class BadAccelerationFlag:
@@ -153,7 +61,7 @@ class BadAccelerationFlag:
     Attributes
     ----------
     since_s, until_s : ndarray, shape (filters,)
-        Start and end of the latest time with a set flag.
+        Start and end of the latest time with a set flag, up to the latest event.
     """
 
     def __init__(
@@ -165,18 +73,19 @@ class BadAccelerationFlag:
             logged_flag = np.zeros(len(time_s), bool)
         self.uses_logged_flag = uses_logged_flag
         self.flag_duration_s = flag_duration_s
+        # Start and end (s) of each logged time with a set flag; the last may have no end
         flag_change_steps = np.flatnonzero(np.diff(logged_flag, prepend=False, append=False))
         self.logged_spans_s = np.append(time_s, np.inf)[flag_change_steps].reshape(-1, 2)
         self.since_s = np.full(len(uses_logged_flag), time_s[0])
-        self.until_s = np.full(
-            len(uses_logged_flag), time_s[0] + flag_duration_s * float(logged_flag[0])
-        )
+        # A flag that is set at the start is set for the usual time
+        self.until_s = self.since_s + flag_duration_s * float(logged_flag[0])
 
     def compute_bad_acceleration_fraction(self, begin_s: Array, end_s: Array) -> Array:
         """Return the fraction of a time interval with a bad acceleration, for each configuration.
 
         Call this method in time order.
         """
+        # Logged flags: the latest span that begins before the end of the interval
         if len(self.logged_spans_s):
             last_row = np.searchsorted(self.logged_spans_s[:, 0], end_s) - 1
             is_flag_from_log = self.uses_logged_flag & (last_row >= 0)
@@ -203,17 +112,15 @@ class BadAccelerationFlag:
         """
         *previous_barometer, previous_gnss = previous_innovations
         *barometer, gnss = innovations
-        # EKF2 tests the latest innovation of each height sensor. The barometer samples of an event
-        # precede its GNSS sample, so they are tested with the previous GNSS innovation. The last
-        # barometer and GNSS samples of the previous event are tested again
+        # EKF2 tests the latest innovation of each height sensor after each fusion: the last samples
+        # of the previous event again, then the barometer samples and the GNSS sample of this event
         latest_barometer = np.full_like(gnss, np.nan)
-        is_acceleration_bad = np.zeros(len(gnss), bool)
-        for sample_number, sample in enumerate((*previous_barometer, *barometer), start=1):
+        for sample in previous_barometer:
             latest_barometer = np.where(np.isnan(sample), latest_barometer, sample)
-            if sample_number >= len(previous_barometer):
-                is_acceleration_bad |= _has_large_height_innovations(
-                    latest_barometer, previous_gnss
-                )
+        is_acceleration_bad = _has_large_height_innovations(latest_barometer, previous_gnss)
+        for sample in barometer:
+            latest_barometer = np.where(np.isnan(sample), latest_barometer, sample)
+            is_acceleration_bad |= _has_large_height_innovations(latest_barometer, previous_gnss)
         is_acceleration_bad |= _has_large_height_innovations(latest_barometer, gnss)
         is_acceleration_bad &= ~self.uses_logged_flag
         self.since_s = np.where(is_acceleration_bad & (self.until_s < time_s), time_s, self.since_s)
@@ -227,29 +134,28 @@ def _has_large_height_innovations(barometer_innovation: Array, gnss_innovation: 
     """
     larger_innovation = np.maximum(barometer_innovation, gnss_innovation)
     smaller_innovation = np.minimum(barometer_innovation, gnss_innovation)
-    return (larger_innovation > MIN_HEIGHT_INNOVATION_OF_ONE_SENSOR) & (
-        smaller_innovation > MIN_HEIGHT_INNOVATION_OF_BOTH_SENSORS
+    return (larger_innovation > MIN_HEIGHT_INNOVATION_SIGMAS_OF_ONE_SENSOR) & (
+        smaller_innovation > MIN_HEIGHT_INNOVATION_SIGMAS_OF_BOTH_SENSORS
     )
 
 
 class HeightFilter:
     """Fusion of heights as in EKF2, for several filter configurations at once.
 
-    Each event fuses the samples since the previous event.
+    Each event fuses the samples since the previous event. The arrays of samples have the shape
+    (k + 1, events, filters): up to k barometer samples of each event, then its GNSS sample.
 
     Parameters
     ----------
-    event_steps : ndarray of int, shape (events, filters)
-        Prediction step of each event.
-    gnss_fix_times_s, has_gnss_fix : ndarray, shape (events, filters)
-        Time of the GNSS fix of each event, and True for events with a fix.
-    is_enabled_by_aid : mapping from PX4's name of a source to ndarray of bool, (events, filters)
-    parameters : mapping from parameter name to ndarray, shape (filters,)
-    has_gate : ndarray of bool, shape (filters,)
-        False to fuse every sample.
+    has_gnss_fix : ndarray of bool, shape (events, filters)
 
     Attributes
     ----------
+    down_m, age_s, time_s, dead_zone_m, weight, has_sample : ndarray
+        Height of each sample, age at its event, measurement time, dead zone, number of EKF2 samples
+        that it represents, and True for a sample (False for padding).
+    last_sample_s : ndarray, shape (filters,)
+        Time (s) of the last sample of the sensor whose bias EKF2 estimates.
     update_records : ndarray, shape (events, k + 2, 4, filters)
         Rows of :func:`~px4fuse.ekf2.replay_segments.make_update_table` for k barometer samples,
         GNSS height and GNSS velocity.
@@ -257,16 +163,12 @@ class HeightFilter:
 
     def __init__(
         self,
-        segment: ReplaySegment,
-        event_steps: IntArray,
-        gnss_fix_times_s: Array,
+        batch: FilterBatch,
         has_gnss_fix: BoolArray,
-        is_enabled_by_aid: Mapping[str, BoolArray],
-        parameters: Mapping[str, Array],
-        has_gate: BoolArray,
         bad_acceleration_flag: BadAccelerationFlag,
     ) -> None:
         self.bad_acceleration_flag = bad_acceleration_flag
+        segment, parameters = batch.segment, batch.parameters
         height_samples = segment.height_samples
         assert height_samples is not None
         self.fused_sensors, samples = height_samples.fused_sensors, height_samples.samples
@@ -277,41 +179,43 @@ class HeightFilter:
                     end_steps,
                     height_samples.step_indices,
                     samples[["down_m"]].to_numpy(),
-                    slice(2, 3),
+                    DOWN_AXIS,
                     samples.index.to_numpy(),
                     *samples[["dead_zone_m", "weight"]].to_numpy().T,
                 )
-                for end_steps in event_steps.T
+                for end_steps in batch.event_steps.T
             ]
         )
-        # Quantities along the first axis: height (m, down), age (s), measurement time (s), dead
-        # zone (m), weight, and 1 for a sample or 0 for padding. Samples along the second axis: k
-        # barometer samples of each event, then its GNSS sample
-        self.samples = np.pad(barometer_samples, ((0, 0), (0, 1), (0, 0), (0, 0)))
-        self.samples[2, -1] = gnss_fix_times_s
-        self.samples[4] = np.maximum(self.samples[4], 1.0)
-        self.samples[5, :-1] *= is_enabled_by_aid[BAROMETER.name]
-        if GNSS_HGT.name in self.fused_sensors:
-            self.samples[5, -1] = has_gnss_fix & is_enabled_by_aid[GNSS_HGT.name]
-        self.has_samples = np.any(self.samples[5], axis=2).tolist()
         self.barometer_sample_count = barometer_samples.shape[1]
-        gates = [
-            np.maximum(parameters.get(aid.gate, MIN_INNOVATION_GATE), MIN_INNOVATION_GATE)
+        self.down_m, self.age_s, self.time_s, self.dead_zone_m, weight, has_sample = np.pad(
+            barometer_samples, ((0, 0), (0, 1), (0, 0), (0, 0))
+        )
+        self.time_s[-1] = batch.events["time_s"]
+        self.weight = np.maximum(weight, 1.0)
+        self.has_sample = (has_sample > 0.0) & batch.is_enabled_by_aid[BAROMETER.name]
+        if GNSS_HGT.name in self.fused_sensors:
+            self.has_sample[-1] = has_gnss_fix & batch.is_enabled_by_aid[GNSS_HGT.name]
+        self.has_samples = np.any(self.has_sample, axis=2).tolist()
+        self.gate_squared = {
+            aid.name: np.where(
+                batch.has_gate,
+                np.maximum(parameters.get(aid.gate, MIN_INNOVATION_GATE), MIN_INNOVATION_GATE) ** 2,
+                np.inf,
+            )
             for aid in HEIGHT_SENSORS
-        ]
-        self.gate_squared = [np.where(has_gate, gate**2, np.inf) for gate in gates]
+        }
         noise_m = parameters.get(BAROMETER.noise, MIN_MEASUREMENT_NOISE_SIGMA)
         self.R_m2 = np.maximum(noise_m, MIN_MEASUREMENT_NOISE_SIGMA) ** 2
         self.reference = height_samples.reference
-        self.is_reference_enabled = is_enabled_by_aid[self.reference]
+        self.is_reference_enabled = batch.is_enabled_by_aid[self.reference]
+        event_count, filter_count = batch.events.shape
         bias_m, bias_variance_m2 = np.tile(
-            height_samples.initial_bias_and_variance, (len(has_gate), 1)
+            height_samples.initial_bias_and_variance, (filter_count, 1)
         ).T
         self.bias = BiasEstimator(bias_m, bias_variance_m2, segment.step_s)
-        # Time (s) of the last sample of the sensor whose bias EKF2 estimates
-        self.last_sample_s = np.full(len(has_gate), segment.time_s[0])
+        self.last_sample_s = np.full(filter_count, segment.time_s[0])
         self.update_records = np.full(
-            (len(event_steps), self.barometer_sample_count + 2, 4, len(has_gate)), np.nan
+            (event_count, self.barometer_sample_count + 2, 4, filter_count), np.nan
         )
 
     def make_update_table(
@@ -325,7 +229,7 @@ class HeightFilter:
         samples = slice(count, count + 1) if sensor == GNSS_HGT.name else slice(count)
         return make_update_table(
             self.update_records[:, samples, :, configuration_index],
-            self.samples[2, samples, :, configuration_index].T,
+            self.time_s[samples, :, configuration_index].T,
             end_s,
             ["down"],
         )
@@ -339,15 +243,22 @@ class HeightFilter:
         self, event: int, x: Array, P: Array, gnss_down_m: Array, gnss_variance_m2: Array
     ) -> ArrayPair:
         """Fuse the GNSS height (m, down) of one event with its R (m²); return x and P."""
-        self.samples[0, -1, event] = gnss_down_m
+        self.down_m[-1, event] = gnss_down_m
         return self._fuse_sample(
             GNSS_HGT, event, self.barometer_sample_count, x, P, gnss_variance_m2
         )
 
-    def update_bad_acceleration_flag(self, event: int, time_s: Array) -> None:
+    def update_bad_acceleration_flag(
+        self, event: int, time_s: Array, velocity_down_update: Array
+    ) -> None:
+        """Update the flag after the fusion of an event at ``time_s``.
+
+        ``velocity_down_update``, shape (2, filters), contains ν and S of the GNSS velocity.
+        """
+        self.update_records[event, -1, :2] = velocity_down_update
         update_records = self.update_records[max(event - 1, 0) : event + 1]
         innovations = -update_records[:, :, 0] / np.sqrt(update_records[:, :, 1])
-        if (innovations > MIN_HEIGHT_INNOVATION_OF_ONE_SENSOR).any():
+        if (innovations > MIN_HEIGHT_INNOVATION_SIGMAS_OF_ONE_SENSOR).any():
             innovations[:, -2] = np.fmax(innovations[:, -2], innovations[:, -1])
             self.bad_acceleration_flag.update(time_s, innovations[0, :-1], innovations[-1, :-1])
 
@@ -357,27 +268,30 @@ class HeightFilter:
         """Fuse a height (m, down) that was measured before the event."""
         if not self.has_samples[sample_index][event]:
             return x, P
-        down_m, age_s, time_s, dead_zone_m, weight, has_sample = self.samples[
-            :, sample_index, event
-        ]
-        has_sample = has_sample > 0.0
+        sample = sample_index, event
+        has_sample, age_s, time_s = self.has_sample[sample], self.age_s[sample], self.time_s[sample]
         # The sample measured an earlier height: height - age_s · vertical velocity
         PH = P[:, :, POSITION_DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
         predicted_variance = PH[:, POSITION_DOWN] - age_s * PH[:, VELOCITY_DOWN]
-        nu = down_m - x[:, POSITION_DOWN] + age_s * x[:, VELOCITY_DOWN]
+        nu = self.down_m[sample] - x[:, POSITION_DOWN] + age_s * x[:, VELOCITY_DOWN]
+        weight = self.weight[sample]
         if aid.name != self.reference:
             last_sample_s = self.last_sample_s
-            self.last_sample_s = np.maximum(last_sample_s, np.where(has_sample, time_s, -np.inf))
+            self.last_sample_s = np.where(
+                has_sample, np.maximum(last_sample_s, time_s), last_sample_s
+            )
             is_bias_updated = has_sample & self.is_reference_enabled[event]
             interval_s = (self.last_sample_s - last_sample_s) * is_bias_updated
             nu, R = self.bias.remove_and_update_bias(
                 nu, predicted_variance, R, interval_s, is_bias_updated, weight
             )
-        nu = nu - np.minimum(np.maximum(nu, 0.0), dead_zone_m)
+        # In ground effect, the measured height is too low: EKF2 reduces a positive innovation
+        nu = nu - np.minimum(np.maximum(nu, 0.0), self.dead_zone_m[sample])
         S = predicted_variance + R
-        gate_squared = self.gate_squared[HEIGHT_SENSORS.index(aid)]
+        gate_squared = self.gate_squared[aid.name]
         is_fused = has_sample & (nu * nu <= gate_squared * S)
         if not is_fused.all():
+            # With a bad vertical acceleration, EKF2 clips the innovation to the gate
             is_clipped = has_sample & (self.bad_acceleration_flag.until_s > time_s)
             limit = np.where(is_clipped, np.sqrt(gate_squared * S), np.inf)
             nu = np.clip(nu, -limit, limit)
@@ -385,5 +299,6 @@ class HeightFilter:
         self.update_records[event, sample_index] = np.where(
             has_sample, (nu, S, ~is_fused, is_fused), np.nan
         )
+        # A sample that represents n EKF2 samples has 1/n of their noise; the gate is that of one
         K = PH * (is_fused / (predicted_variance + R / weight))[:, None]
         return x + K * nu[:, None], P - K[:, :, None] * PH[:, None]

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray, compute_median_interval_s
-from px4fuse.ekf2.heights import add_heights
+from px4fuse.ekf2.height_samples import add_heights
 from px4fuse.ekf2.replay_segments import (
     MIN_IMU_GAP_S,
     MIN_SEGMENT_DURATION_S,
@@ -33,7 +33,7 @@ from px4fuse.flight.ekf2_parameters import (
     GNSS_VEL,
     MAG,
     Aid,
-    fill_with_defaults,
+    fill_parameters_with_defaults,
     uses_aid_mask,
 )
 from px4fuse.flight.model import (
@@ -47,11 +47,11 @@ from px4fuse.flight.model import (
     Unavailable,
     sample_step_function,
 )
-from px4fuse.readers.common import find_flight_spans
+from px4fuse.readers.common import find_spans
 from px4fuse.readers.px4_innovations import has_fused_aid, replace_vision_by_gnss_innovations
 from px4fuse.readers.px4_positions import MAX_DOWNSAMPLED_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE_REMEDY
-from px4fuse.trajectory.rotation import conjugate, multiply, rotate, to_matrix
+from px4fuse.trajectory.rotation import conjugate, multiply, rotate, to_rotation_matrix
 
 ANALYSIS_NAME = "EKF2 replay"
 # Note in the log of a simulated flight
@@ -251,10 +251,10 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
         return innovations
     flow_samples = fusion_record.flow if is_gnss else pd.DataFrame()
-    modelled_labels = [GNSS_POS.label, GNSS_VEL.label] if is_gnss else []
-    modelled_labels += [FLOW.label] if len(flow_samples) else []
+    modelled_aid_labels = [GNSS_POS.label, GNSS_VEL.label] if is_gnss else []
+    modelled_aid_labels += [FLOW.label] if len(flow_samples) else []
     if unmodelled_aids := [
-        label for label in fusion_record.other_horizontal_aids if label not in modelled_labels
+        label for label in fusion_record.other_horizontal_aids if label not in modelled_aid_labels
     ]:
         return Unavailable(
             ANALYSIS_NAME,
@@ -285,11 +285,10 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     )
     if isinstance(vision_positions, Unavailable):
         return vision_positions
-    # Since PX4 v1.17, GNSS messages contain the lever arm of the receiver
-    gnss_track = _find_gnss_track(flight) if is_gnss else None
-    lever_arm = (
-        {} if gnss_track is None else dict(zip(aid.lever_arm, gnss_track.lever_arm_m, strict=True))
-    )
+    lever_arm = {}
+    if is_gnss and (gnss_track := _find_gnss_track(flight)):
+        # Since PX4 v1.17, GNSS messages contain the lever arm of the receiver
+        lever_arm = dict(zip(aid.lever_arm, gnss_track.lever_arm_m, strict=True))
     if isinstance(horizon_s, Unavailable):
         if not flight.log.firmware.startswith(FIRST_RELEASE_WITH_HORIZON_TIMES):
             return horizon_s
@@ -323,14 +322,16 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
             reason_to_use_logged_height = segments_with_heights
         else:
             segments = segments_with_heights
-    other_aids = [EV_POS] if vision_positions else []
-    other_aids += [MAG] if any(segment.magnetic_field for segment in segments) else []
     height_samples = segments[0].height_samples
-    other_aids += (
-        [BAROMETER] if height_samples and BAROMETER.name in height_samples.fused_sensors else []
-    )
+    is_other_aid_fused = {
+        EV_POS: vision_positions is not None,
+        MAG: any(segment.magnetic_field for segment in segments),
+        BAROMETER: height_samples and BAROMETER.name in height_samples.fused_sensors,
+    }
+    other_aids = [other_aid for other_aid, is_fused in is_other_aid_fused.items() if is_fused]
     return ReplayInputs(
-        settings=fill_with_defaults(fusion_record.parameters, aid, *other_aids) | lever_arm,
+        settings=fill_parameters_with_defaults(fusion_record.parameters, aid, *other_aids)
+        | lever_arm,
         segments=segments,
         received_positions=received_positions,
         rules=_make_fusion_rules(fusion_record, ekf2.step_s, is_gnss=is_gnss),
@@ -390,9 +391,15 @@ def _make_fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: b
                 fusion_rules, reset_variance_factor=1.0, bad_acceleration_flag_duration_s=10.0
             )
     elif uses_aid_mask(parameters):
-        fusion_rules = FusionRules(np.inf, 7.0, 7.0, NO_RESET_LIMIT)
+        fusion_rules = FusionRules(
+            max_sample_interval_to_start_s=np.inf,
+            stop_timeout_s=7.0,
+            reset_timeout_s=7.0,
+            max_resets=NO_RESET_LIMIT,
+        )
     return replace(
         fusion_rules,
+        # EKF2 up to v1.14 limits the variance of the velocity change by the bias in one step
         min_accelerometer_bias_variance_m2_s4=5e-8 / step_s**2
         if fusion_record.has_delta_angle_biases
         else None,
@@ -447,7 +454,7 @@ def read_gnss(
         velocity_samples = velocity_samples[is_enabled]
     # EKF2_GPS_DELAY is already subtracted from the times of the track. It is added here, because
     # the replay subtracts it again
-    logged_delay_s = fill_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
+    logged_delay_s = fill_parameters_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
     timestamp_s = position_samples.index.to_numpy() + logged_delay_s
     # Maximum reported position noise (m) that EKF2 uses (gps_control.cpp)
     max_reported_noise_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
@@ -469,7 +476,7 @@ def read_gnss(
         track.name,
         velocity,
         velocity_variance,
-        uses_sender_timestamps=track.assumed_delay_s == 0.0 != logged_delay_s,
+        uses_sender_timestamps=track.assumed_delay_s == 0.0 and logged_delay_s != 0.0,
     )
 
 
@@ -487,12 +494,14 @@ def read_vision(
     timestamp_s = position_samples.index.to_numpy()
     position_m = position_samples[Columns.POSITION].to_numpy(copy=True)
     variance_m2 = position_samples[Columns.POSITION_VARIANCE].fillna(0.0).to_numpy(copy=True)
-    is_rotated_by_ekf2 = (
-        not isinstance(ekf2.fusion_flags, pd.DataFrame) or not ekf2.fusion_flags["yaw"].any()
-    )
+    # If EKF2 fuses the vision heading, its heading is that of the vision frame. Otherwise, EKF2
+    # rotates the positions to north. Before PX4 v1.14, a parameter decides this
     if uses_aid_mask(fusion_record.parameters):
-        is_rotated_by_ekf2 = bool(
-            int(fusion_record.parameters[AID_MASK_PARAMETER]) & ROTATE_VISION_BIT
+        aid_mask = int(fusion_record.parameters[AID_MASK_PARAMETER])
+        is_rotated_by_ekf2 = aid_mask & ROTATE_VISION_BIT > 0
+    else:
+        is_rotated_by_ekf2 = (
+            not isinstance(ekf2.fusion_flags, pd.DataFrame) or not ekf2.fusion_flags["yaw"].any()
         )
     if track.frame == "FRD" and is_rotated_by_ekf2:
         if track.orientation is None:
@@ -506,7 +515,7 @@ def read_vision(
             interpolate_attitude(orientations, timestamp_s)
             for orientations in (attitude, track.orientation)
         )
-        rotation = to_matrix(multiply(ekf2_attitude, conjugate(source_attitude)))
+        rotation = to_rotation_matrix(multiply(ekf2_attitude, conjugate(source_attitude)))
         position_m = rotate(rotation, position_m)
         variance_m2 = rotate(rotation**2, variance_m2)
     vision_age_s = fusion_record.vision_age_s
@@ -571,40 +580,40 @@ def _read_logged_decisions(
         or innovation_topic(aid) not in ekf2.innovation_topics
     ):
         return rejected_flags, is_reset
-    delay_s = fill_with_defaults(fusion_record.parameters, aid)[aid.delay] * 1e-3
+    delay_s = fill_parameters_with_defaults(fusion_record.parameters, aid)[aid.delay] * 1e-3
     measurement_times_s = timestamp_s - delay_s - 0.5 * ekf2.step_s
     # EKF2 fuses a late sample when it arrives
     earliest_fusion_times_s = np.maximum.accumulate(
         np.maximum(measurement_times_s, arrival_s - horizon_s)
     )
-    aid_rows = ekf2.aids[aid.name].samples
-    # EKF2 rejected all samples from its last fusion (last_fused_s) to the time of the log row, and
-    # during dead reckoning
-    last_fusion_times_s = aid_rows.reindex(columns=["last_fused_s"]).dropna()
-    spans_after_last_fusion_s = np.column_stack([last_fusion_times_s, last_fusion_times_s.index])
-    dead_reckoning_spans_s = (
-        _find_dead_reckoning_spans(ekf2, fusion_record)
-        if aid == EV_POS
-        else spans_after_last_fusion_s[:0]
-    )
-    row_ranges_of_rejections = np.searchsorted(
+    # EKF2 rejected all samples from its last fusion (last_fused_s) to the time of the log row
+    last_fusion_times_s = ekf2.aids[aid.name].samples.reindex(columns=["last_fused_s"]).dropna()
+    last_fusion_rows, log_rows = np.searchsorted(
         earliest_fusion_times_s,
-        np.concatenate([spans_after_last_fusion_s, dead_reckoning_spans_s])
+        np.array([last_fusion_times_s["last_fused_s"], last_fusion_times_s.index])
         + PREDICTION_STEP_TOLERANCE_S,
     )
-    for begin, end in row_ranges_of_rejections.tolist():
+    rejection_rows = [*zip(last_fusion_rows, log_rows, strict=True)]
+    # EKF2 also rejected all samples during dead reckoning, except the last, which ended it
+    last_rows_of_dead_reckoning = []
+    if aid == EV_POS:
+        spans_s = _find_dead_reckoning_spans(ekf2, fusion_record)
+        for begin, end in np.searchsorted(
+            earliest_fusion_times_s, spans_s + PREDICTION_STEP_TOLERANCE_S
+        ):
+            rejection_rows.append((begin, end))
+            last_rows_of_dead_reckoning.append(end - 1)
+    for begin, end in rejection_rows:
         rejected_flags[begin : max(end - 1, 0)] = 1.0
     may_be_reset_sample = np.isnan(rejected_flags)
-    sample_rows = find_matching_samples(innovations.index.to_numpy(), measurement_times_s)
-    innovations_of_samples = innovations.iloc[sample_rows[sample_rows >= 0]]
-    rejected_flags[sample_rows >= 0] = innovations_of_samples["rejected"]
+    # Logged decisions on single samples
+    innovation_rows = find_matching_samples(innovations.index.to_numpy(), measurement_times_s)
+    is_logged = innovation_rows >= 0
+    innovations_of_samples = innovations.iloc[innovation_rows[is_logged]]
+    rejected_flags[is_logged] = innovations_of_samples["rejected"]
     # EKF2 logs innovation 0 for a sample to which it resets its position
-    may_be_reset_sample[sample_rows >= 0] &= (innovations_of_samples["rejected"] > 0.0) | (
+    may_be_reset_sample[is_logged] &= (innovations_of_samples["rejected"] > 0.0) | (
         innovations_of_samples["innovation_m"] == 0.0
-    )
-    rows_of_last_fusions = row_ranges_of_rejections[: len(spans_after_last_fusion_s), 0] - 1
-    last_sample_rows_in_dead_reckoning = (
-        row_ranges_of_rejections[len(spans_after_last_fusion_s) :, 1] - 1
     )
     # A reset is published later than its measurement by the delay of the fusion horizon
     publication_times_s = earliest_fusion_times_s + horizon_s
@@ -613,17 +622,16 @@ def _read_logged_decisions(
             publication_times_s > reset_s - MAX_RESET_PUBLICATION_DELAY_S
         )
         reset_rows = np.flatnonzero(is_published_near_reset & may_be_reset_sample)
-        reset_rows_after_dead_reckoning = np.intersect1d(
-            reset_rows, last_sample_rows_in_dead_reckoning
-        )
-        is_reset[
-            reset_rows_after_dead_reckoning[:1]
-            if len(reset_rows_after_dead_reckoning)
-            else reset_rows[-1:]
-        ] = True
-    is_fused = np.zeros(len(is_reset), bool)
-    is_fused[rows_of_last_fusions[rows_of_last_fusions >= 0]] = True
-    rejected_flags[is_fused & ~is_reset & np.isnan(rejected_flags)] = 0.0
+        rows_after_dead_reckoning = np.intersect1d(reset_rows, last_rows_of_dead_reckoning)
+        # A reset ends dead reckoning; otherwise, it is to the newest sample
+        if len(rows_after_dead_reckoning):
+            is_reset[rows_after_dead_reckoning[0]] = True
+        elif len(reset_rows):
+            is_reset[reset_rows[-1]] = True
+    # The samples of the last fusions are not rejected
+    fused_rows = last_fusion_rows[last_fusion_rows > 0] - 1
+    is_undecided = ~is_reset[fused_rows] & np.isnan(rejected_flags[fused_rows])
+    rejected_flags[fused_rows[is_undecided]] = 0.0
     return rejected_flags, is_reset
 
 
@@ -636,7 +644,7 @@ def _find_dead_reckoning_spans(ekf2: Ekf2, fusion_record: FusionRecord) -> Array
     vision_enabled_flag = ekf2.status_flags.get(EV_POS.name)
     if dead_reckoning_flag is None or vision_enabled_flag is None:
         return np.zeros((0, 2))
-    spans_s = np.array(find_flight_spans(dead_reckoning_flag == 0.0, np.inf)).reshape(-1, 2)
+    spans_s = np.array(find_spans(dead_reckoning_flag != 0.0, np.inf)).reshape(-1, 2)
     spans_s[:, 0] -= DEAD_RECKONING_TIMEOUT_S * (
         sample_step_function(vision_enabled_flag, spans_s[:, 0]) > 0.0
     )
@@ -667,10 +675,12 @@ def find_horizontal_reset_times_s(ekf2: Ekf2) -> Array:
 def _find_vision_track(flight: Flight) -> PositionTrack | Unavailable:
     """Return the vision track with all positions that EKF2 received."""
     missing_reasons = ["the log has no topic vehicle_visual_odometry"]
+    # Topics of the log are preferred to a position file
     for track in sorted(flight.positions, key=lambda track: track.origin == POSITION_FILE_ORIGIN):
         if track.origin.is_vision and track.origin.has_all_samples:
             return track
         if track.name in LOGGING_INTERVAL_BY_VISION_TOPIC_S:
+            # A median clearly below the default logging interval means a higher logging rate
             median_interval_s = compute_median_interval_s(track.samples.index)
             if (
                 median_interval_s < 0.9 * LOGGING_INTERVAL_BY_VISION_TOPIC_S[track.name]

@@ -47,7 +47,7 @@ DERIVATIVE_COLUMN_COUNT = 11
 COLUMN_OF_DERIVATIVE_BY_ATTITUDE_CORRECTION, COLUMN_OF_DERIVATIVE_BY_ACCELERATION = 9, 10
 
 # One row per event: fusion of a position or, in a gap, of height and heading only
-StepEvents = np.recarray[Any, Any]
+FusionEvents = np.recarray[Any, Any]
 EVENT_DTYPE = np.dtype(
     [
         ("end_step", np.intp),  # prediction step of the event
@@ -78,40 +78,35 @@ class EventIntervals:
         are the state changes by EKF2's attitude correction and by the measured acceleration.
     """
 
-    events: StepEvents
+    events: FusionEvents
     prediction_step_counts: Array
     duration_s: Array
     state_derivatives: Array
 
     def compute_transitions(self, rows: slice) -> tuple[Array, ...]:
-        """Return state transition and process noise of E intervals between fusions.
+        """Return transition and process noise of the motion state in E intervals between fusions.
+
+        The other states are constant.
 
         Returns
         -------
-        transition : ndarray, shape (E, 15, 15)
-        state_change_by_attitude_correction, state_change_by_acceleration : ndarray, shape (E, 15)
-            Change of the state in an interval by EKF2's attitude correction, and by acceleration.
+        transition : ndarray, shape (E, 9, 15)
+            Derivatives of the motion state with respect to all states except magnetic fields.
+        state_change_by_attitude_correction, state_change_by_acceleration : ndarray, shape (E, 9)
+            Change of the motion state in an interval by EKF2's attitude correction, and by
+            acceleration.
         gyro_noise_covariance, accelerometer_noise_covariance : ndarray, shape (E, 9, 9)
             Process noise per prediction step, for 1 rad/s (gyroscope) or 1 m/s² (accelerometer).
         """
         state_derivatives, duration_s = self.state_derivatives[rows], self.duration_s[rows]
-        transition = np.tile(np.eye(STATE_COUNT), (len(duration_s), 1, 1))
-        state_change_by_attitude_correction, state_change_by_acceleration = np.zeros(
-            (2, len(duration_s), STATE_COUNT)
-        )
-        transition[:, :MOTION_STATE_COUNT, THETA] = state_derivatives[..., :3]
-        transition[:, :MOTION_STATE_COUNT, BIASES] = state_derivatives[..., 3:9]
-        state_change_by_attitude_correction[:, :MOTION_STATE_COUNT] = state_derivatives[
-            ..., COLUMN_OF_DERIVATIVE_BY_ATTITUDE_CORRECTION
-        ]
-        state_change_by_acceleration[:, :MOTION_STATE_COUNT] = state_derivatives[
-            ..., COLUMN_OF_DERIVATIVE_BY_ACCELERATION
-        ]
+        transition = np.tile(np.eye(MOTION_STATE_COUNT, STATE_COUNT), (len(duration_s), 1, 1))
+        transition[:, :, THETA] = state_derivatives[..., :3]
+        transition[:, :, BIASES] = state_derivatives[..., 3:9]
         transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
         return (
             transition,
-            state_change_by_attitude_correction,
-            state_change_by_acceleration,
+            state_derivatives[..., COLUMN_OF_DERIVATIVE_BY_ATTITUDE_CORRECTION],
+            state_derivatives[..., COLUMN_OF_DERIVATIVE_BY_ACCELERATION],
             *_compute_imu_process_noise(
                 self.prediction_step_counts[rows], duration_s, transition[:, VELOCITY, THETA]
             ),
@@ -141,7 +136,7 @@ def make_event_intervals(
 
     The number of intervals does not depend on ``delays``.
     """
-    events = _make_events(inputs, segment, delays)
+    events = _make_fusion_events(inputs, segment, delays)
     end_steps = events.end_step
     start_steps = np.append(0, end_steps[:-1])
     return EventIntervals(
@@ -152,7 +147,9 @@ def make_event_intervals(
     )
 
 
-def _make_events(inputs: ReplayInputs, segment: ReplaySegment, delays: FusionDelays) -> StepEvents:
+def _make_fusion_events(
+    inputs: ReplayInputs, segment: ReplaySegment, delays: FusionDelays
+) -> FusionEvents:
     received_positions = inputs.received_positions
     time_s = segment.time_s
     first_row, end_row = np.searchsorted(received_positions.timestamp_s, time_s[[0, -1]])
@@ -181,35 +178,28 @@ def _make_events(inputs: ReplayInputs, segment: ReplaySegment, delays: FusionDel
     )
     event_row_by_sample = np.cumsum(event_counts_in_gaps[:-1] + 1) - 1
     event_count = len(timestamp_s) + int(event_counts_in_gaps.sum())
-    events = np.zeros(event_count, EVENT_DTYPE)
-    events["end_step"] = np.rint(
+    events = np.zeros(event_count, EVENT_DTYPE).view(np.recarray)
+    # The events in a gap divide it into equal numbers of prediction steps
+    events.end_step = np.rint(
         np.interp(
             np.arange(event_count),
             np.r_[-1, event_row_by_sample, event_count],
             np.r_[0, fusion_step_by_sample, last_step],
         )
     )
-    events["sample"], events["time_s"] = -1, time_s[events["end_step"]]
-    is_late = (
-        is_inside
-        & is_in_time
-        & (earliest_fusion_times_s - measurement_times_s > MIN_DELAY_OF_LATE_SAMPLE_S)
-    )
-    is_too_late = is_inside & ~is_in_time
-    events[event_row_by_sample] = np.rec.fromarrays(
-        [
-            fusion_step_by_sample,
-            np.arange(first_row, end_row),
-            action,
-            is_usable,
-            can_start_fusion,
-            is_late,
-            is_too_late,
-            measurement_times_s,
-        ],
-        dtype=EVENT_DTYPE,
-    )
-    return events.view(np.recarray)
+    events.sample, events.time_s = -1, time_s[events.end_step]
+    delay_of_fusion_s = earliest_fusion_times_s - measurement_times_s
+    for name, values in (
+        ("sample", np.arange(first_row, end_row)),
+        ("action", action),
+        ("usable", is_usable),
+        ("can_start_fusion", can_start_fusion),
+        ("late", is_inside & is_in_time & (delay_of_fusion_s > MIN_DELAY_OF_LATE_SAMPLE_S)),
+        ("lost", is_inside & ~is_in_time),
+        ("time_s", measurement_times_s),
+    ):
+        events[name][event_row_by_sample] = values
+    return events
 
 
 def _find_fusion_actions(
@@ -232,13 +222,14 @@ def _find_fusion_actions(
     can_start_fusion[usable_rows] = (
         np.diff(usable_times_s, prepend=-np.inf) < fusion_rules.max_sample_interval_to_start_s
     )
-    # Time (s) since the previous usable sample
+    # EKF2 checks the stop timeout in each prediction step: the last check without the new sample is
+    # in the step before its fusion
     sample_gaps_s = segment.time_s[end_steps[usable_rows] - 1] - np.append(
         np.inf, usable_times_s[:-1]
     )
     is_fusing = segment.starts_while_fusing
     for row, gap_s in zip(usable_rows.tolist(), sample_gaps_s.tolist(), strict=True):
-        is_fusing = is_fusing and not gap_s > fusion_rules.stop_timeout_s
+        is_fusing = is_fusing and gap_s <= fusion_rules.stop_timeout_s
         if is_fusing:
             action[row] = FUSE
         elif can_start_fusion[row]:
@@ -257,8 +248,8 @@ def _integrate_state_derivatives(
     EKF2's attitude correction (1) and by the measured acceleration (1).
     """
     prediction_step_counts = end_steps - start_steps
-    # All intervals are integrated together, step by step. Sorted by length, the intervals that have
-    # not ended are always the first rows
+    # All intervals are integrated together, step by step. Sorted by length, longest first, the
+    # intervals that have not ended are always the first rows
     longest_first_indices = np.argsort(-prediction_step_counts, kind="stable")
     start_steps_longest_first = start_steps[longest_first_indices]
     attitude_derivatives, velocity_derivatives, position_derivatives = state_derivatives = np.zeros(
@@ -267,17 +258,16 @@ def _integrate_state_derivatives(
     attitude_derivatives[:, :, 0:3] = np.eye(3)
     specific_force_ned_m_s2 = rotate(segment.body_to_ned[1:], segment.specific_force_m_s2)
     step_numbers = np.arange(int(prediction_step_counts.max(initial=0)))
-    for step_number, count in zip(
-        step_numbers,
-        np.searchsorted(-prediction_step_counts[longest_first_indices], -step_numbers),
-        strict=True,
-    ):
-        step = start_steps_longest_first[:count] + step_number
-        rows = slice(count)
+    # Number of intervals with more than 0, 1, 2, ... steps
+    active_counts = np.searchsorted(-prediction_step_counts[longest_first_indices], -step_numbers)
+    for step_number, active_count in zip(step_numbers, active_counts, strict=True):
+        rows = slice(active_count)
+        step = start_steps_longest_first[rows] + step_number
         dt = segment.step_s[step][:, None, None]
         force_m_s2 = specific_force_ned_m_s2[step]
         # Change of attitude per gyro bias, and of velocity per accelerometer bias, in one step
         state_derivative_by_bias_in_step = -segment.body_to_ned[1:][step] * dt
+        # Position changes by the mean of the velocities before and after the step
         position_derivatives[rows] += 0.5 * dt * velocity_derivatives[rows]
         velocity_derivatives[rows] += (-skew(force_m_s2) * dt) @ attitude_derivatives[rows]
         velocity_derivatives[rows, :, 6:9] += state_derivative_by_bias_in_step
@@ -289,6 +279,7 @@ def _integrate_state_derivatives(
         attitude_derivatives[rows, :, COLUMN_OF_DERIVATIVE_BY_ATTITUDE_CORRECTION] -= (
             segment.attitude_correction_rad[step]
         )
+    # Restore the order of the intervals
     state_derivatives[:, longest_first_indices] = state_derivatives.copy()
     return np.concatenate(state_derivatives, axis=1)
 
@@ -298,8 +289,12 @@ def _compute_imu_process_noise(
 ) -> tuple[Array, Array]:
     """Return the process noise for unit gyro noise, and for unit accelerometer noise.
 
-    The specific force is assumed to be constant in an interval. For the effect of gyro noise on
-    velocity and position, only the leading terms are used.
+    The specific force is assumed to be constant in an interval of n steps of length d. In one step,
+    an attitude error changes the velocity by m per rad. Noise that acts k steps before the end of
+    the interval changes the attitude by d, the velocity by k m d (gyro) or d (accelerometer), and
+    the position by k (k - 1) m d² / 2 or k d². The blocks are sums of products of these changes
+    over all k. For the effect of gyro noise on the position, some sums are replaced by their
+    leading terms.
     """
     n = np.maximum(prediction_step_counts, 1.0)[:, None, None]
     d = duration_s[:, None, None] / n

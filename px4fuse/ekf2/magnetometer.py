@@ -43,6 +43,7 @@ def average_by_event(
     segment: ReplaySegment, sensor_samples: SensorSamples, event_end_steps: IntArray
 ) -> EventSamples:
     """Return the mean of the magnetometer or optical flow samples before each fusion."""
+    # The samples may be means of several EKF2 samples, whose numbers are added
     event_index = np.searchsorted(event_end_steps, sensor_samples.step_indices)
     # The last row contains the samples after the last event
     row_count = len(event_end_steps) + 1
@@ -91,19 +92,19 @@ def fuse_mean_sample(
     bias_states : slice, optional
         State indices of the sensor bias (body frame).
     """
-    measured_vector = x[:, measured_states]
+    estimated_vector_ned = x[:, measured_states]
     sample_count, R = mean_sample.sample_count, mean_sample.noise
     H = np.zeros((len(x), mean_sample.value.shape[-1], x.shape[1]))
-    H[:, :, THETA] = mean_sample.ned_to_body_rotation @ skew(measured_vector)
+    H[:, :, THETA] = mean_sample.ned_to_body_rotation @ skew(estimated_vector_ned)
     H[:, :, measured_states] = mean_sample.ned_to_body_rotation @ (np.eye(3) - skew(x[:, THETA]))
-    predicted_value = (H[:, :, measured_states] @ measured_vector[:, :, None])[:, :, 0]
+    predicted_value = (H[:, :, measured_states] @ estimated_vector_ned[:, :, None])[:, :, 0]
     if bias_states is not None:
         H[:, :, bias_states] = np.eye(3)
         predicted_value += x[:, bias_states]
     nu = mean_sample.value - predicted_value
     HP = H @ P
     S = HP @ H.transpose(0, 2, 1)
-    # innovation_variances is a view of S: adding R to it changes S
+    # innovation_variances is a view of the diagonal of S: adding R to it below changes S
     innovation_variances = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]
     has_sample = sample_count > 0.0
     update = np.empty((3, *nu.shape))
@@ -111,6 +112,7 @@ def fuse_mean_sample(
     is_fused = has_sample & (nu * nu <= gate[:, None] ** 2 * update[1]).all(axis=1)
     update[2] = is_fused[:, None]
     update[:, ~has_sample] = np.nan
+    # Noise of the mean of n samples: R / n. Without a sample, 1 avoids a singular S
     innovation_variances += np.where(has_sample, R / np.maximum(sample_count, 1.0), 1.0)[:, None]
     K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * is_fused[:, None, None]
     x = x + (K @ nu[:, :, None])[:, :, 0]

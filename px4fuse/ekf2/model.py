@@ -5,7 +5,7 @@ has 15 error states, or 21 with a magnetometer. Without a height sensor, the rep
 published height. Without a magnetometer, the replay uses EKF2's published heading.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,16 +18,15 @@ from px4fuse.core.arrays import (
     Array,
     ArrayPair,
     BoolArray,
-    IntArray,
     cumulative_sums,
     select_intervals,
 )
 from px4fuse.core.record import Span
+from px4fuse.ekf2.filter_batch import FilterConfiguration
 from px4fuse.ekf2.filter_recursion import (
     HEADING,
     HORIZONTAL_POSITION,
     HORIZONTAL_POSITION_COLUMNS,
-    FilterConfiguration,
     SegmentRun,
     estimate_state_correlation,
     run_segment,
@@ -39,10 +38,10 @@ from px4fuse.ekf2.output_predictor import compute_published_state, sum_attitude_
 from px4fuse.ekf2.replay import (
     HORIZONTAL_AXES,
     MAX_REJECTED_FRACTION_FOR_COMPARISON,
-    Agreement,
     Ekf2Replay,
+    ReplayAgreement,
     compare_with_log,
-    judge_with_logged_rejections,
+    judge_agreement_with_logged_rejections,
 )
 from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
@@ -74,8 +73,6 @@ MAX_HORIZON_DELAY_S = 1.0
 
 # Number of replays that are computed at once; limits the memory
 REPLAY_BATCH_SIZE = 10
-# Number of intervals between fusions whose states are computed at once; limits the memory
-EVENTS_PER_BLOCK = 512
 
 
 @dataclass(frozen=True)
@@ -86,14 +83,14 @@ class Ekf2Model:
     ----------
     baseline_replay : Ekf2Replay
         Replay with the logged parameters.
-    agreement : Agreement
+    agreement : ReplayAgreement
         Agreement of this replay with the log.
     """
 
     flight: Flight
     inputs: ReplayInputs
     baseline_replay: Ekf2Replay
-    agreement: Agreement
+    agreement: ReplayAgreement
     runs: tuple[SegmentRun, ...] = ()
 
 
@@ -102,75 +99,79 @@ def prepare_ekf2_model(
     list_later_configurations: Callable[
         [ReplayInputs], Sequence[FilterConfiguration]
     ] = lambda _: (),
-    failed_agreement_by_aid: Mapping[str, Agreement] = {},
 ) -> Ekf2Model | Unavailable:
     """Prepare EKF2 replays of a flight, and replay the flight with the logged parameters.
 
-    If the replay does not agree with the log for an aiding source, the function calls itself and
-    omits this source.
+    If the replay does not agree with the log for an aiding source, it is repeated without this
+    source.
 
     Parameters
     ----------
     list_later_configurations : callable
         Function that returns the filter configurations that later analyses need. They are computed
         together with the logged configuration, which is faster.
-    failed_agreement_by_aid : mapping from PX4's name to Agreement
-        Aiding sources to omit, with the agreement of the replay that still fused them. Only the
-        function itself passes this argument.
     """
-    omitted_aids = {
-        name: agreement.doubtful[name] for name, agreement in failed_agreement_by_aid.items()
-    }
-    inputs = prepare_inputs(flight, omitted_aids)
-    if isinstance(inputs, Unavailable):
-        return structs.replace(inputs, what=ANALYSIS_NAME)
-    logged_flight = flight
-    if inputs.aid == GNSS_POS and isinstance(flight.ekf2, Ekf2):
-        flight = replace(flight, ekf2=replace_vision_by_gnss_innovations(flight.ekf2))
-    baseline_configuration = FilterConfiguration(inputs.settings)
-    segments = tuple(estimate_state_correlation(inputs, segment) for segment in inputs.segments)
-    inputs = replace(inputs, segments=segments)
-    configurations = [baseline_configuration]
-    for configuration in list_later_configurations(inputs):
-        configurations += [] if configuration in configurations else [configuration]
-    runs = run_configurations(inputs, configurations)
-    baseline_replay = _make_replay(inputs, runs, baseline_configuration, {})
-    agreement = compare_with_log(flight, baseline_replay)
-    if isinstance(agreement, Unavailable):
-        return agreement
-    if further_omitted_aids := agreement.doubtful.keys() - failed_agreement_by_aid.keys():
-        return prepare_ekf2_model(
-            logged_flight,
-            list_later_configurations,
-            {**failed_agreement_by_aid, **dict.fromkeys(further_omitted_aids, agreement)},
-        )
-    model = Ekf2Model(flight, inputs, baseline_replay, agreement, tuple(runs))
+    # Agreement of the replay that still fused an omitted source, by PX4's name of the source
+    failed_agreement_by_aid: dict[str, ReplayAgreement] = {}
+    while True:
+        omitted_aids = {
+            name: agreement.doubtful[name] for name, agreement in failed_agreement_by_aid.items()
+        }
+        model = _replay_logged_parameters(flight, list_later_configurations, omitted_aids)
+        if isinstance(model, Unavailable):
+            return model
+        agreement = model.agreement
+        further_omitted_aids = agreement.doubtful.keys() - omitted_aids.keys()
+        if not further_omitted_aids:
+            break
+        failed_agreement_by_aid |= dict.fromkeys(further_omitted_aids, agreement)
     if (
         max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
         > MAX_REJECTED_FRACTION_FOR_COMPARISON
-        and np.isfinite(inputs.received_positions.rejected_flags).any()
+        and np.isfinite(model.inputs.received_positions.rejected_flags).any()
     ):
         agreement_with_logged_rejections = compare_with_log(
-            flight, replay_with_logged_rejections(model)
+            model.flight, replay_with_logged_rejections(model)
         )
-        if isinstance(agreement_with_logged_rejections, Agreement):
-            agreement = judge_with_logged_rejections(agreement, agreement_with_logged_rejections)
-    # This replay omits some aiding sources. Their agreement with the log is from the earlier replay
-    # that fused them
-    failed_agreement_by_field = {
-        (field_name := "carried_difference_m" if name == FLOW.name else name): getattr(
-            failed_agreement, field_name
-        )
-        for name, failed_agreement in failed_agreement_by_aid.items()
-    }
-    agreement = structs.replace(
-        agreement, doubtful={**omitted_aids, **agreement.doubtful}, **failed_agreement_by_field
-    )
+        if isinstance(agreement_with_logged_rejections, ReplayAgreement):
+            agreement = judge_agreement_with_logged_rejections(
+                agreement, agreement_with_logged_rejections
+            )
+    fields: dict[str, Any] = {"doubtful": {**omitted_aids, **agreement.doubtful}}
+    for name, failed_agreement in failed_agreement_by_aid.items():
+        field_name = "carried_difference_m" if name == FLOW.name else name
+        fields[field_name] = getattr(failed_agreement, field_name)
+    agreement = structs.replace(agreement, **fields)
     return replace(
         model,
-        baseline_replay=structs.replace(baseline_replay, agreement=agreement),
+        baseline_replay=structs.replace(model.baseline_replay, agreement=agreement),
         agreement=agreement,
     )
+
+
+def _replay_logged_parameters(
+    flight: Flight,
+    list_later_configurations: Callable[[ReplayInputs], Sequence[FilterConfiguration]],
+    omitted_aids: Mapping[str, str],
+) -> Ekf2Model | Unavailable:
+    """Replay a flight without the omitted aiding sources, and compare the replay with the log."""
+    inputs = prepare_inputs(flight, omitted_aids)
+    if isinstance(inputs, Unavailable):
+        return structs.replace(inputs, what=ANALYSIS_NAME)
+    if inputs.aid == GNSS_POS and isinstance(flight.ekf2, Ekf2):
+        flight = replace(flight, ekf2=replace_vision_by_gnss_innovations(flight.ekf2))
+    segments = tuple(estimate_state_correlation(inputs, segment) for segment in inputs.segments)
+    inputs = replace(inputs, segments=segments)
+    configurations = [FilterConfiguration(inputs.settings)]
+    for configuration in list_later_configurations(inputs):
+        if configuration not in configurations:
+            configurations.append(configuration)
+    runs = run_configurations(inputs, configurations)
+    baseline_replay = _make_replay(inputs, runs, configurations[0], {})
+    agreement = compare_with_log(flight, baseline_replay)
+    if isinstance(agreement, Unavailable):
+        return agreement
+    return Ekf2Model(flight, inputs, baseline_replay, agreement, tuple(runs))
 
 
 def replay_with_logged_rejections(model: Ekf2Model) -> Ekf2Replay:
@@ -202,33 +203,11 @@ def replay_with_settings(
         Unknown parameter or aiding source, or a value outside PX4's range.
     """
     changes = [check_parameters(change) for change in settings]
-    inputs = model.inputs
-    reasons = {}
-    if inputs.rules.is_horizon_set_by_largest_delay:
-        reasons["EKF2_DELAY_MAX"] = (
-            f"{model.flight.log.firmware} has no EKF2_DELAY_MAX: the largest sensor delay "
-            "parameter sets the delay of the fusion horizon"
-        )
-    if inputs.received_positions.uses_sender_timestamps:
-        reasons[GNSS_POS.delay] = "EKF2 uses measurement times that the GNSS driver reports"
-    for name in (name for change in changes for name in change):
-        if name in reasons or name not in inputs.settings:
-            reason = reasons.get(name) or _describe_modelled_aids(inputs)
-            raise SettingsError(f"{name} has no effect in a replay of this log: {reason}.")
-    for name in disable_time_s_by_aid:
-        if name not in list_modelled_aids(inputs):
-            raise SettingsError(f"{name} cannot be omitted: {_describe_modelled_aids(inputs)}.")
+    changed_names = (name for change in changes for name in change)
+    _check_replayed_names(model, changed_names, disable_time_s_by_aid)
     if excluded_times_s is not None:
-        received_positions = inputs.received_positions
-        is_excluded = _find_excluded_rows(received_positions.timestamp_s, excluded_times_s)
-        received_positions = replace(
-            received_positions,
-            rejected_flags=np.where(is_excluded, 1.0, np.nan),
-            is_reset_to_sample=np.zeros_like(is_excluded),
-            is_every_reset_logged=False,
-        )
-        inputs = replace(inputs, received_positions=received_positions)
-        model = replace(model, inputs=inputs, runs=())
+        model = _exclude_samples(model, excluded_times_s)
+    inputs = model.inputs
     configurations = [
         FilterConfiguration(
             {**inputs.settings, **change},
@@ -250,6 +229,46 @@ def replay_with_settings(
                 ~_find_excluded_rows(updates.index.to_numpy(), excluded_times_s - age_s)
             ]
         yield structs.replace(replay, updates=updates, agreement=model.agreement)
+
+
+def _check_replayed_names(
+    model: Ekf2Model, parameter_names: Iterable[str], aid_names: Iterable[str]
+) -> None:
+    """Raise SettingsError if a replay cannot use a parameter, or omit an aiding source."""
+    inputs = model.inputs
+    reasons = {}
+    if inputs.rules.is_horizon_set_by_largest_delay:
+        reasons["EKF2_DELAY_MAX"] = (
+            f"{model.flight.log.firmware} has no EKF2_DELAY_MAX: the largest sensor delay "
+            "parameter sets the delay of the fusion horizon"
+        )
+    if inputs.received_positions.uses_sender_timestamps:
+        reasons[GNSS_POS.delay] = "EKF2 uses measurement times that the GNSS driver reports"
+    for name in parameter_names:
+        if name in reasons or name not in inputs.settings:
+            reason = reasons.get(name) or _describe_modelled_aids(inputs)
+            raise SettingsError(f"{name} has no effect in a replay of this log: {reason}.")
+    for name in aid_names:
+        if name not in list_modelled_aids(inputs):
+            raise SettingsError(f"{name} cannot be omitted: {_describe_modelled_aids(inputs)}.")
+
+
+def _exclude_samples(model: Ekf2Model, excluded_times_s: Array) -> Ekf2Model:
+    """Return a model that rejects the position samples with these timestamps."""
+    received_positions = model.inputs.received_positions
+    is_excluded = _find_excluded_rows(received_positions.timestamp_s, excluded_times_s)
+    received_positions = replace(
+        received_positions,
+        rejected_flags=np.where(is_excluded, 1.0, np.nan),
+        is_reset_to_sample=np.zeros_like(is_excluded),
+        is_every_reset_logged=False,
+    )
+    return _replace_inputs(model, received_positions=received_positions)
+
+
+def _replace_inputs(model: Ekf2Model, **changes: Any) -> Ekf2Model:
+    """Return a model with other inputs, without the replays with the previous inputs."""
+    return replace(model, inputs=replace(model.inputs, **changes), runs=())
 
 
 def _find_excluded_rows(sample_times_s: Array, excluded_times_s: Array) -> BoolArray:
@@ -288,8 +307,7 @@ def add_position_noise(model: Ekf2Model, sigma_m: float, seed: int) -> Ekf2Model
         if samples := getattr(model.inputs, name):
             position_noise_m = rng.normal(scale=sigma_m, size=samples.position_m.shape)
             noisy_inputs[name] = replace(samples, position_m=samples.position_m + position_noise_m)
-    # The runs are without the added noise, so they are deleted
-    return replace(model, inputs=replace(model.inputs, **noisy_inputs), runs=())
+    return _replace_inputs(model, **noisy_inputs)
 
 
 def misalign_positions(model: Ekf2Model, rotation_deg: float, delay_s: float) -> Ekf2Model:
@@ -305,8 +323,7 @@ def misalign_positions(model: Ekf2Model, rotation_deg: float, delay_s: float) ->
         position_m=received_positions.position_m @ rotation_matrix,
         velocity_m_s=None if velocity_m_s is None else velocity_m_s @ rotation_matrix,
     )
-    inputs = replace(model.inputs, received_positions=received_positions)
-    return replace(model, inputs=inputs, runs=())
+    return _replace_inputs(model, received_positions=received_positions)
 
 
 def compute_delayed_tracks(
@@ -318,7 +335,7 @@ def compute_delayed_tracks(
     """
     runs = _run_model(model, configurations)
     for index in map(runs[0].configurations.index, configurations):
-        yield pd.concat([_make_delayed_track(run, index) for run in runs])
+        yield pd.concat([_make_track(run, compute_delayed_states(run, index)) for run in runs])
 
 
 def _run_model(
@@ -352,17 +369,11 @@ def run_configurations(
     ]
 
 
-def _make_delayed_track(run: SegmentRun, configuration_index: int) -> pd.DataFrame:
-    state = compute_delayed_states(run, configuration_index)
-    return _make_track(run, state[:, VELOCITY], state[:, POSITION])
-
-
-def _make_track(run: SegmentRun, velocity_m_s: Array, position_m: Array) -> pd.DataFrame:
+def _make_track(run: SegmentRun, state: Array) -> pd.DataFrame:
     """Return a table of velocity (m/s) and position (m, in EKF2's published coordinates)."""
-    states = np.hstack(
-        [position_m / run.segment.internal_to_published_position_ratio, velocity_m_s]
-    )
-    return pd.DataFrame(states, time_index(run.segment.time_s), Columns.STATE, copy=False)
+    position_m = state[:, POSITION] / run.segment.internal_to_published_position_ratio
+    track = np.hstack([position_m, state[:, VELOCITY]])
+    return pd.DataFrame(track, time_index(run.segment.time_s), Columns.STATE, copy=False)
 
 
 def _make_replay(
@@ -413,6 +424,7 @@ def _collect_updates_by_aid(
     inputs: ReplayInputs, run: SegmentRun, configuration_index: int
 ) -> dict[str, pd.DataFrame]:
     """Return the updates of one filter configuration, by PX4's name of the aiding source."""
+    # Columns of R, nu and S: velocity and position, see SegmentRun
     events, height_filter = run.events[configuration_index], run.height_filter
     end_s = run.segment.time_s[events.end_step]
     nu, S, R, rejected, fused, reset, posterior_variance = (
@@ -471,10 +483,12 @@ def _make_state_tracks(
     segment = run.segment
     configuration = run.configurations[configuration_index]
     state = compute_delayed_states(run, configuration_index)
+    # Position resets since the start, after each step
     reset_m = np.zeros((len(state), 3))
     event_steps = run.events[configuration_index].end_step
     np.add.at(reset_m[:, :2], event_steps, run.position_reset_m[:, configuration_index])
     horizon_s = min(configuration.compute_delays(inputs).horizon_s, MAX_HORIZON_DELAY_S)
+    # Steps from the fusion horizon to the present, for which the output predictor predicts
     lag_steps = max(round(horizon_s / inputs.mean_step_s), 1)
     # Without attitude states, EKF2's published attitude is not corrected
     attitude_correction_rad = np.zeros((len(state), 3))
@@ -482,7 +496,8 @@ def _make_state_tracks(
         attitude_correction_rad = sum_attitude_corrections(
             state[:, THETA] - segment.attitude_error_rad, lag_steps, inputs.mean_step_s, horizon_s
         )
-    published_velocity, published_position = compute_published_state(
+    published_state = np.zeros_like(state)
+    published_state[:, VELOCITY], published_position_m = compute_published_state(
         segment,
         state,
         np.cumsum(reset_m, axis=0),
@@ -490,61 +505,30 @@ def _make_state_tracks(
         lag_steps,
         configuration.settings,
     )
+    # EKF2 publishes the position of the vehicle's origin, not of the IMU (output_predictor.cpp)
+    published_state[:, POSITION] = published_position_m - segment.body_to_ned @ inputs.imu_offset_m
     heading_rad = (
         np.arctan2(segment.body_to_ned[:, 1, 0], segment.body_to_ned[:, 0, 0]) + state[:, HEADING]
     )
-    # EKF2 publishes the position of the vehicle's origin, not of the IMU (output_predictor.cpp)
-    published_position = published_position - segment.body_to_ned @ inputs.imu_offset_m
-    fusion_horizon_track = _make_track(run, state[:, VELOCITY], state[:, POSITION])
-    return fusion_horizon_track.assign(heading_rad=heading_rad), _make_track(
-        run, published_velocity, published_position
+    return _make_track(run, state).assign(heading_rad=heading_rad), _make_track(
+        run, published_state
     )
 
 
 def compute_delayed_states(run: SegmentRun, configuration_index: int) -> Array:
     """Return the state at the fusion horizon after each of n prediction steps.
 
-    The state has the shape (n + 1, 15) or more.
+    The state has the shape (n + 1, 15) or more. Between the fusions, the IMU predicts attitude
+    error, velocity and position, and the biases are constant.
     """
+    segment, step_s = run.segment, run.segment.step_s[:, None]
     event_states = run.state[:, configuration_index]
     event_steps = run.events[configuration_index].end_step
-    step_count = len(run.segment.step_s)
-    # First prediction step of the interval after each event, and end of the last interval
-    first_steps = np.concatenate([[0], event_steps, [step_count]])
-    states = np.empty((step_count + 1, event_states.shape[1]))
-    states[0] = event_states[0]
-    for first_event in range(0, len(event_states), EVENTS_PER_BLOCK):
-        block_first_steps = first_steps[first_event : first_event + EVENTS_PER_BLOCK + 1]
-        states[1:][block_first_steps[0] : block_first_steps[-1]] = _propagate_states(
-            run, configuration_index, event_states[first_event:], block_first_steps
-        )
-    states[event_steps] = event_states[1:]
-    return states
-
-
-def _propagate_states(
-    run: SegmentRun, configuration_index: int, event_states: Array, first_steps: IntArray
-) -> Array:
-    """Predict the state with the IMU from each fusion to the steps before the next fusion.
-
-    Parameters
-    ----------
-    event_states : ndarray, shape (intervals or more, states)
-        State at the start of each interval, after a fusion.
-    first_steps : ndarray of int, shape (intervals + 1,)
-        Index of the first step of each interval, and of the last step plus 1.
-
-    Returns
-    -------
-    ndarray, shape (steps, states)
-        State at the end of each step. The biases are constant between fusions.
-    """
-    segment, configuration = run.segment, run.configurations[configuration_index]
-    interval_lengths = np.diff(first_steps)
-    event_states = event_states[: len(interval_lengths)]
-    state = np.repeat(event_states, interval_lengths, axis=0)
-    steps = slice(first_steps[0], first_steps[-1])
-    body_to_ned, step_s = segment.body_to_ned[1:][steps], segment.step_s[steps, None]
+    start_steps = np.append(0, event_steps)
+    interval_lengths = np.diff(start_steps, append=len(step_s))
+    states = np.concatenate([event_states[:1], np.repeat(event_states, interval_lengths, axis=0)])
+    # State at the end of each step; initially the state after the previous fusion
+    state = states[1:]
 
     def integrate(rows: slice, increments: Array) -> ArrayPair:
         """Return the state elements ``rows`` before and after each prediction step.
@@ -553,23 +537,24 @@ def _propagate_states(
         then.
         """
         sums = cumulative_sums(increments)
-        sums_at_events = sums[first_steps[:-1] - first_steps[0]]
-        offsets = np.repeat(event_states[:, rows] - sums_at_events, interval_lengths, axis=0)
+        offsets = np.repeat(event_states[:, rows] - sums[start_steps], interval_lengths, axis=0)
         return sums[:-1] + offsets, sums[1:] + offsets
 
     # Prediction of attitude error, velocity and position, see intervals.py
+    body_to_ned = segment.body_to_ned[1:]
     rotation_increments_rad = -rotate(body_to_ned, state[:, GYRO_BIAS]) * step_s
-    if configuration.estimates_attitude:
-        rotation_increments_rad -= segment.attitude_correction_rad[steps]
-    attitude_error_before_rad, state[:, THETA] = integrate(THETA, rotation_increments_rad)
-    specific_force_ned_m_s2 = rotate(body_to_ned, segment.specific_force_m_s2[steps])
+    if run.configurations[configuration_index].estimates_attitude:
+        rotation_increments_rad -= segment.attitude_correction_rad
+    attitude_error_before_step_rad, state[:, THETA] = integrate(THETA, rotation_increments_rad)
+    specific_force_ned_m_s2 = rotate(body_to_ned, segment.specific_force_m_s2)
     acceleration = (
-        np.cross(attitude_error_before_rad, specific_force_ned_m_s2)
+        np.cross(attitude_error_before_step_rad, specific_force_ned_m_s2)
         + specific_force_ned_m_s2
         + GRAVITY_M_S2
     )
     acceleration -= rotate(body_to_ned, state[:, ACCELEROMETER_BIAS])
-    velocity_before_m_s, state[:, VELOCITY] = integrate(VELOCITY, acceleration * step_s)
-    mean_velocity_m_s = 0.5 * (velocity_before_m_s + state[:, VELOCITY])
+    velocity_before_step_m_s, state[:, VELOCITY] = integrate(VELOCITY, acceleration * step_s)
+    mean_velocity_m_s = 0.5 * (velocity_before_step_m_s + state[:, VELOCITY])
     state[:, POSITION] = integrate(POSITION, mean_velocity_m_s * step_s)[1]
-    return state
+    states[event_steps] = event_states[1:]
+    return states

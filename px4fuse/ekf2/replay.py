@@ -14,8 +14,8 @@ from px4fuse.core.record import (
     NOT_IN_JSON,
     Correlation,
     Count,
+    NonNegativeFloat,
     NotInJson,
-    NotNegative,
     PositiveFloat,
     Record,
     Share,
@@ -94,17 +94,17 @@ class AxisAgreement(Record, kw_only=True):
     """
 
     innovation_correlation: Correlation
-    innovation_rms_difference: NotNegative
+    innovation_rms_difference: NonNegativeFloat
     s_ratio_median: PositiveFloat
     s_ratio_p5: PositiveFloat
     s_ratio_p95: PositiveFloat
-    nis_mean_logged: NotNegative
-    nis_mean_replayed: NotNegative
-    position_rms_difference_m: NotNegative
-    velocity_rms_difference_m_s: NotNegative
+    nis_mean_logged: NonNegativeFloat
+    nis_mean_replayed: NonNegativeFloat
+    position_rms_difference_m: NonNegativeFloat
+    velocity_rms_difference_m_s: NonNegativeFloat
 
 
-class Agreement(Record, kw_only=True):
+class ReplayAgreement(Record, kw_only=True):
     """Agreement of the EKF2 replay with the log.
 
     Attributes
@@ -144,11 +144,11 @@ class Agreement(Record, kw_only=True):
     rejected_fraction_logged: Share
     rejected_fraction_replayed: Share
     decisions_same: Share
-    published_rms_difference_m: NotNegative
+    published_rms_difference_m: NonNegativeFloat
     good: bool
     reason: str
-    heading_rms_difference_deg: NotNegative | None = None
-    carried_difference_m: NotNegative | None = None
+    heading_rms_difference_deg: NonNegativeFloat | None = None
+    carried_difference_m: NonNegativeFloat | None = None
     doubtful: Mapping[str, str] = {}
 
     @property
@@ -195,7 +195,7 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
     settings: Mapping[str, float]
     late: Count = 0
     lost: Count = 0
-    agreement: Agreement | None = None
+    agreement: ReplayAgreement | None = None
     changed_parameters: NotInJson[Mapping[str, float]] = NOT_IN_JSON
     updates: NotInJson[pd.DataFrame] = NOT_IN_JSON
     delayed_state: NotInJson[pd.DataFrame] = NOT_IN_JSON
@@ -220,7 +220,7 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
         return tuple(evaluated_spans_s)
 
 
-def compare_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavailable:
+def compare_with_log(flight: Flight, replay: Ekf2Replay) -> ReplayAgreement | Unavailable:
     """Compare an EKF2 replay with the logged innovations and states."""
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
@@ -234,20 +234,22 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavaila
             "Record vehicle_local_position during the whole flight.",
         )
     aid = find_replayed_position_source(ekf2)
-    agreement_by_axis, statistics = _compare_innovations(
+    comparison = _compare_innovations(
         replay,
         replay.updates,
         logged_innovations(ekf2),
         innovation_topic(aid) in ekf2.innovation_topics,
         state_difference,
     )
-    if not agreement_by_axis:
+    if isinstance(comparison, str):
         return Unavailable(
             ANALYSIS_NAME,
-            statistics["reason"],
+            comparison,
             "Record a longer flight with motion, with SDLOG_PROFILE bit 0 (default).",
         )
+    agreement_by_axis, statistics = comparison
     agreement_by_aid, omitted_aids = _compare_other_aids(ekf2, replay, state_difference)
+    # While EKF2 fuses only optical flow, position errors add up: the largest difference is compared
     flow_only_difference = _subtract_logged_state(
         replay, rows_inside(ekf2.state, replay.optical_flow_only_spans_s)
     )
@@ -263,7 +265,7 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavaila
                 f"{_format_unlike_limit(flow_position_difference_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m "
                 f"(limit {MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
             )
-    return Agreement(
+    return ReplayAgreement(
         **(agreement_by_aid | agreement_by_axis | {aid.name: agreement_by_axis} | statistics),
         doubtful=omitted_aids,
         published_rms_difference_m=math.hypot(
@@ -280,11 +282,11 @@ def _compare_innovations(
     logged_innovations: pd.DataFrame,
     has_measurement_times: bool,
     state_difference: pd.DataFrame,
-) -> tuple[dict[str, AxisAgreement], dict[str, Any]]:
+) -> tuple[dict[str, AxisAgreement], dict[str, Any]] | str:
     """Compare replayed with logged innovations.
 
-    Return the agreement by axis (empty if the innovations cannot be compared), and fields of
-    :class:`Agreement` for all axes together.
+    Return the agreement by axis, and fields of :class:`ReplayAgreement` for all axes together; or
+    the reason why the innovations cannot be compared.
     """
     update_rows = match_updates(
         replayed_innovations,
@@ -301,26 +303,25 @@ def _compare_innovations(
     logged_innovations = logged_innovations[is_used]
     replayed_innovations = replayed_innovations.iloc[update_rows[is_used]]
     if len(logged_innovations) < MIN_COMPARED_INNOVATIONS:
-        reason = (
+        return (
             f"the log contains only {format_count(len(logged_innovations), 'innovation')} in the "
             f"replayed time (at least {MIN_COMPARED_INNOVATIONS} are needed)"
         )
-        return {}, {"good": False, "reason": reason}
     compared_innovations = (logged_innovations, replayed_innovations)
     if not all(np.ptp(innovations[columns], axis=0).all() for innovations in compared_innovations):
-        return {}, {"good": False, "reason": CONSTANT_INNOVATIONS_REASON}
+        return CONSTANT_INNOVATIONS_REASON
     is_rejected = np.array([innovations["rejected"] > 0.0 for innovations in compared_innovations])
     agreement_by_axis: dict[str, AxisAgreement] = {
         axis: _compare_axis(axis, *compared_innovations, state_difference) for axis in axes
     }
-    logged_fraction, replayed_fraction = is_rejected.mean(axis=1).tolist()
+    logged_rejected_fraction, replayed_rejected_fraction = is_rejected.mean(axis=1).tolist()
     is_in_agreement, reason = _judge_agreement(
-        agreement_by_axis, logged_fraction, replayed_fraction
+        agreement_by_axis, logged_rejected_fraction, replayed_rejected_fraction
     )
     return agreement_by_axis, {
         "samples": len(logged_innovations),
-        "rejected_fraction_logged": logged_fraction,
-        "rejected_fraction_replayed": replayed_fraction,
+        "rejected_fraction_logged": logged_rejected_fraction,
+        "rejected_fraction_replayed": replayed_rejected_fraction,
         "decisions_same": float(np.mean(np.equal(*is_rejected))),
         "good": is_in_agreement,
         "reason": reason,
@@ -349,8 +350,10 @@ def _compute_heading_difference_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | N
     heading_at_log_times_rad = np.interp(
         logged_state.index, replayed_heading_rad.index, np.unwrap(replayed_heading_rad)
     )
-    difference_rad = np.angle(np.exp(1j * (heading_at_log_times_rad - heading_rad(logged_state))))
-    return float(np.degrees(rms(difference_rad)))
+    heading_difference_rad = np.angle(
+        np.exp(1j * (heading_at_log_times_rad - heading_rad(logged_state)))
+    )
+    return float(np.degrees(rms(heading_difference_rad)))
 
 
 def _compare_other_aids(
@@ -368,19 +371,22 @@ def _compare_other_aids(
         # Without logged measurement times, innovations are matched by fusion time. The replay fuses
         # barometer samples later than EKF2, so the measurement time replaces their fusion time
         times_s = updates.index if name == BAROMETER.name else updates["fused_at_s"]
-        agreement_by_axis, statistics = _compare_innovations(
+        comparison = _compare_innovations(
             replay,
             updates.assign(fused_at_s=times_s),
             select_logged_aid_innovations(name, aid_log),
             innovation_topic(AIDS[name]) in aid_log.topics,
             state_difference,
         )
-        if agreement_by_axis:
-            agreement_by_aid[name] = agreement_by_axis
-        reason = statistics["reason"]
-        is_velocity = name == GNSS_VEL.name
-        if not statistics["good"] and (not is_velocity or reason == CONSTANT_INNOVATIONS_REASON):
-            omitted_aids[name] = reason
+        # GNSS velocity is omitted only if its innovations are constant, as those of a frozen sensor
+        may_disagree = name == GNSS_VEL.name
+        if isinstance(comparison, str):
+            if not may_disagree or comparison == CONSTANT_INNOVATIONS_REASON:
+                omitted_aids[name] = comparison
+            continue
+        agreement_by_aid[name], statistics = comparison
+        if not (statistics["good"] or may_disagree):
+            omitted_aids[name] = statistics["reason"]
     return agreement_by_aid, omitted_aids
 
 
@@ -567,9 +573,9 @@ def _format_unlike_limit(value: float, limit: float) -> str:
     return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > limit or n == 16)
 
 
-def judge_with_logged_rejections(
-    agreement: Agreement, agreement_with_logged_rejections: Agreement
-) -> Agreement:
+def judge_agreement_with_logged_rejections(
+    agreement: ReplayAgreement, agreement_with_logged_rejections: ReplayAgreement
+) -> ReplayAgreement:
     """Judge the agreement of replay and log for a flight in which EKF2 rejected many samples.
 
     If replay and EKF2 reject different samples, they differ much even with a correct model.
@@ -579,9 +585,9 @@ def judge_with_logged_rejections(
 
     Parameters
     ----------
-    agreement : Agreement
+    agreement : ReplayAgreement
         Agreement of the replay that decides itself on rejections.
-    agreement_with_logged_rejections : Agreement
+    agreement_with_logged_rejections : ReplayAgreement
         Agreement of the replay that rejects the same samples as EKF2.
     """
     rejected_fraction = agreement.rejected_fraction_logged

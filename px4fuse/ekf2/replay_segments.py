@@ -26,7 +26,7 @@ from px4fuse.core.arrays import (
     interpolate_columns,
 )
 from px4fuse.core.record import Span
-from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
 from px4fuse.flight.model import (
     BAD_ACCELERATION_FLAG,
     FLOW_FILTER_NEW_SAMPLE_WEIGHT,
@@ -48,7 +48,7 @@ from px4fuse.trajectory.rotation import (
     interpolate,
     multiply,
     rotate,
-    to_matrix,
+    to_rotation_matrix,
     to_rotation_vector,
 )
 
@@ -361,7 +361,8 @@ def find_replay_segments(
     assert isinstance(innovations, pd.DataFrame)
     state_times_s = fusion_record.delayed_state.index.to_numpy()
     imu_times_s = imu.index.to_numpy()
-    # The replay restarts when another EKF2 instance with another state becomes primary
+    # Times at which the replay ends and restarts: ends of the IMU data, another primary EKF2
+    # instance (with another state), and start and end of each gap
     boundary_times_s = [imu_times_s[0], imu_times_s[-1]]
     boundary_times_s += [time_s for time_s, _ in ekf2.primary_instances[1:]]
     for sample_times_s, limit in ((imu_times_s, MIN_IMU_GAP_S), (position_times_s, RESTART_GAP_S)):
@@ -373,8 +374,11 @@ def find_replay_segments(
         magnetic_field_start_s, magnetic_field_end_s = _find_magnetometer_3d_fusion_span(
             fusion_record
         )
-    parameter_changes = [change for change in ekf2.parameter_changes if change.name in PARAMETERS]
+    parameter_changes = [
+        change for change in ekf2.parameter_changes if change.name in MODEL_PARAMETERS
+    ]
     boundary_times_s += [magnetic_field_end_s, *(change.time_s for change in parameter_changes)]
+    # The limits of the last IMU interval and of the last position are included
     earliest_start_s = max(attitude.index[0], imu_times_s[0] - MIN_IMU_GAP_S, position_times_s[0])
     end_s = min(attitude.index[-1], imu_times_s[-1] + MIN_IMU_GAP_S, position_times_s[-1] + 1.0)
     takeoff_s = -np.inf
@@ -398,11 +402,13 @@ def find_replay_segments(
         if part_start_s <= magnetic_field_start_s < part_end_s:
             start_s = max(start_s, magnetic_field_start_s)
         start_row = int(np.searchsorted(state_times_s, start_s))
+        # The replay starts from a logged state
         if (
             start_row == len(state_times_s)
             or part_end_s - state_times_s[start_row] < MIN_SEGMENT_DURATION_S
         ):
             continue
+        # The part may itself be a gap of the IMU
         is_covered = (imu_times_s[1:] > state_times_s[start_row]) & (imu_times_s[:-1] < part_end_s)
         if not np.all(np.diff(imu_times_s)[is_covered] <= MIN_IMU_GAP_S):
             continue
@@ -473,15 +479,15 @@ def compute_internal_to_published_position_ratio(fusion_record: FusionRecord) ->
     eccentricity_squared = ECCENTRICITY**2
     q = 1.0 - eccentricity_squared * np.sin(np.radians(fusion_record.latitude_deg)) ** 2
     # PX4 uses the exponent 2.5 for the meridian radius; the exponent of an ellipsoid is 1.5
-    radii_m = (
+    earth_curvature_radii_m = (
         EQUATORIAL_RADIUS_M * np.array([(1.0 - eccentricity_squared) / q**2.5, q**-0.5])
         + fusion_record.altitude_m
     )
-    return np.append(radii_m / EARTH_RADIUS_M, 1.0)
+    return np.append(earth_curvature_radii_m / EARTH_RADIUS_M, 1.0)
 
 
 def _find_interruption_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
-    """Return the times (s) of clipping and height resets, which interrupt the replay."""
+    """Return start and end (s) of each clipping and height reset, which interrupt the replay."""
     interruption_times_s = [
         time
         for reset in ekf2.resets
@@ -491,12 +497,13 @@ def _find_interruption_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
     if "clipped" in imu:
         imu_times_s = imu.index.to_numpy()
         clipped_times_s = imu_times_s[imu["clipped"].to_numpy() > 0.0]
+        # Number of clipped samples from 0.5 s before to 0.5 s after each clipped sample
         window_begin_rows, window_end_rows = (
             np.searchsorted(clipped_times_s, clipped_times_s + s) for s in (-0.5, 0.5)
         )
+        samples_per_second = 1.0 / compute_median_interval_s(imu_times_s)
         heavy_clipping_times_s = clipped_times_s[
-            window_end_rows - window_begin_rows
-            > MAX_CLIPPED_IMU_FRACTION / compute_median_interval_s(imu_times_s)
+            window_end_rows - window_begin_rows > MAX_CLIPPED_IMU_FRACTION * samples_per_second
         ]
         interruption_times_s += [*(heavy_clipping_times_s - 0.5), *(heavy_clipping_times_s + 0.5)]
     return interruption_times_s
@@ -527,6 +534,7 @@ def _make_segment(
     start_row: int,
     end_s: float,
 ) -> ReplaySegment:
+    """Make the segment from a row of ``estimator_states`` to ``end_s``."""
     initial_row = fusion_record.delayed_state.iloc[start_row].astype(np.float64)
     imu_times_s = imu.index.to_numpy()
     first_row = int(np.argmin(np.abs(imu_times_s - fusion_record.delayed_state.index[start_row])))
@@ -550,13 +558,19 @@ def _make_segment(
     )
     step_times_s = imu_times_s[np.append(0, step_end_indices)]
     step_s = np.diff(step_times_s)
+    # Attitude relative to the start, from the gyro alone
     gyro_attitude = cumulative_product(
         np.concatenate([[[1.0, 0.0, 0.0, 0.0]], from_rotation_vector(rotation_vectors)])
     )
 
-    def compute_relative_attitude(
+    def compute_rotation_from_end_attitude(
         attitude_samples: pd.DataFrame, lead_time_s: float, end_attitude: Array
     ) -> ArrayPair:
+        """Return the times (s) of the samples, and their rotation relative to ``end_attitude``.
+
+        ``end_attitude`` is the attitude at the end of each step. Samples up to ``lead_time_s``
+        before the start are included.
+        """
         attitude_samples = rows_between(
             attitude_samples, step_times_s[0] - lead_time_s, step_times_s[-1]
         )
@@ -568,10 +582,11 @@ def _make_segment(
 
     # Rotation (in NED) that turns the gyro's integrated attitude into EKF2's published attitude
     rotation_to_published_attitude = interpolate(
-        step_times_s, *compute_relative_attitude(attitude, 0.0, gyro_attitude)
+        step_times_s, *compute_rotation_from_end_attitude(attitude, 0.0, gyro_attitude)
     )
     nominal_attitude = multiply(rotation_to_published_attitude, gyro_attitude)
-    state_times_s, error_quaternions = compute_relative_attitude(
+    # The first state row may be up to 0.1 ms before the first IMU sample
+    state_times_s, error_quaternions = compute_rotation_from_end_attitude(
         fusion_record.delayed_state, 1e-4, nominal_attitude
     )
     attitude_error_rad = to_rotation_vector(error_quaternions)
@@ -584,7 +599,7 @@ def _make_segment(
         time_s=step_times_s,
         step_s=step_s,
         # float32 (as in PX4) saves memory: these arrays are the largest
-        body_to_ned=to_matrix(nominal_attitude).astype(np.float32),
+        body_to_ned=to_rotation_matrix(nominal_attitude).astype(np.float32),
         attitude_correction_rad=to_rotation_vector(
             multiply(
                 rotation_to_published_attitude[1:], conjugate(rotation_to_published_attitude[:-1])
@@ -601,8 +616,8 @@ def _make_segment(
             fusion_record.delayed_state[Columns.FUSION_HORIZON_VARIANCE[:3]], step_times_s
         ).astype(np.float32),
         down_variance_m2=_interpolate(fusion_record.delayed_state[["down_m2"]], step_times_s)[:, 0],
-        attitude_error_rad=_interpolate(
-            pd.DataFrame(attitude_error_rad, state_times_s), step_times_s
+        attitude_error_rad=interpolate_columns(
+            step_times_s, state_times_s, attitude_error_rad
         ).astype(np.float32),
         initial_state_correlation=np.eye(15),
         is_acceleration_bad=(
@@ -637,13 +652,19 @@ def _find_magnetometer_3d_fusion_span(fusion_record: FusionRecord) -> Span:
 def _add_magnetic_field(
     segment: ReplaySegment, fusion_record: FusionRecord, start_row: int, step_s: float
 ) -> ReplaySegment:
+    """Add magnetic field states and magnetometer samples to a segment.
+
+    If the log contains EKF2's low-pass filtered innovations, the samples that EKF2 fused between
+    two rows are computed from them. Otherwise, the samples in the log represent all samples.
+    """
     initial_row = fusion_record.delayed_state.iloc[start_row]
     field_gauss = fusion_record.magnetic_field_gauss
     sample_times_s = field_gauss.index.to_numpy()
+    # EKF2 subtracts its delay parameter and half a prediction step from the sample times
     age_s = fusion_record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     fused_samples_per_row = max(MAG_FUSION_HZ * compute_median_interval_s(sample_times_s), 1.0)
     measurement_times_s = sample_times_s - age_s
-    segment_with_magnetic_field_states = add_field_states(
+    segment_with_magnetic_field_states = add_magnetic_field_states(
         segment,
         measurement_times_s,
         field_gauss.iloc[:, :3].to_numpy(),
@@ -689,7 +710,7 @@ def _compute_mean_magnetic_field(
         row_interval_s + fused_sample_counts * INNOVATION_LOW_PASS_TIME_CONSTANT_S
     )
     previous_innovation_weight = ((1.0 - new_sample_weight) ** fused_sample_counts)[:, None]
-    nu_gauss = (
+    unfiltered_field_innovation_gauss = (
         filtered_field_innovation_gauss[gap_free_rows]
         - previous_innovation_weight * filtered_field_innovation_gauss[gap_free_rows - 1]
     ) / (1.0 - previous_innovation_weight)
@@ -705,17 +726,19 @@ def _compute_mean_magnetic_field(
         _interpolate(delayed_state[names], measurement_times_s)
         for names in (Columns.EARTH_MAGNETIC_FIELD, Columns.BODY_MAGNETIC_FIELD)
     )
-    earth_field_with_attitude_error = earth_field_gauss[:, None] - np.cross(
+    earth_field_with_attitude_error_gauss = earth_field_gauss[:, None] - np.cross(
         segment.attitude_error_rad[step_indices], earth_field_gauss[:, None]
     )
     expected_field_gauss = (
-        np.einsum("ki,kiab,kib->ka", weight, ned_to_body_rotation, earth_field_with_attitude_error)
+        np.einsum(
+            "ki,kiab,kib->ka", weight, ned_to_body_rotation, earth_field_with_attitude_error_gauss
+        )
         + body_field_gauss
     )
     mean_rotation_to_body = np.einsum("ki,kiab->kab", weight, ned_to_body_rotation)
     return SensorSamples(
         step_indices[:, 0],
-        expected_field_gauss - nu_gauss,
+        expected_field_gauss - unfiltered_field_innovation_gauss,
         mean_rotation_to_body,
         fused_sample_counts,
         np.zeros(len(gap_free_rows)),
@@ -728,6 +751,7 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     The logged velocity is low-pass filtered. The replay fuses the mean velocity between two logged
     samples. ``gate`` is the innovation gate (√S).
     """
+    # Time of the first sample in each mean
     begin_s = flow.index - (flow["samples"] - 1.0) * flow["interval_s"]
     flow = flow[(begin_s > segment.time_s[0]) & (flow.index <= segment.time_s[-1])]
     sample_count = flow["samples"].to_numpy()
@@ -735,7 +759,10 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     step_index, weight = compute_low_pass_weights(
         segment, flow.index.to_numpy(), sample_count, interval_s, FLOW_FILTER_NEW_SAMPLE_WEIGHT
     )
+    # Axes forward and right
     ned_to_body_rotation = segment.body_to_ned[step_index].swapaxes(2, 3)[:, :, :2]
+    # Mean over the samples (i) of each mean (k): velocity change from the IMU in body axes. Without
+    # it, the samples of one mean measure the same velocity
     imu_velocity_m_s = np.einsum(
         "ki,kiab,kib->ka", weight, ned_to_body_rotation, segment.imu_velocity_change_m_s[step_index]
     )
@@ -783,7 +810,7 @@ def compute_low_pass_weights(
     return np.searchsorted(segment.time_s, measurement_times_s - 1e-9), weight
 
 
-def add_field_states(
+def add_magnetic_field_states(
     segment: ReplaySegment,
     measurement_times_s: Array,
     field_gauss: Array,
@@ -846,13 +873,16 @@ def find_step_ends(
 ) -> IntArray:
     """Return the index of the IMU sample at the end of each prediction step of EKF2."""
     median_interval_s = float(np.median(interval_s))
+    # EKF2 counts samples. If samples are missing in the log, an interval counts as several samples.
     # A small number of missing samples is ignored: the IMU itself may have gaps
     sample_counts = np.maximum(np.rint(interval_s / median_interval_s), 1.0)
     if sample_counts.mean() <= 1.0 + MAX_LOST_IMU_FRACTION:
         sample_counts[:] = 1.0
-    sample_counts_at_logged_ends = np.append(0.0, np.cumsum(sample_counts))[logged_step_end_indices]
+    sample_numbers_at_logged_step_ends = np.append(0.0, np.cumsum(sample_counts))[
+        logged_step_end_indices
+    ]
     samples_per_step = compute_samples_per_step(
-        configured_step_s, median_interval_s, sample_counts_at_logged_ends
+        configured_step_s, median_interval_s, sample_numbers_at_logged_step_ends
     )
     logged_step_end_index_set = set(logged_step_end_indices.tolist())
     end_indices = []
@@ -862,6 +892,7 @@ def find_step_ends(
     ):
         accumulated_count += sample_count
         accumulated_time_s += interval
+        # A step ends after a number of samples, at a time limit, or where the log contains a state
         if (
             (accumulated_count >= samples_per_step and accumulated_time_s > 0.5 * configured_step_s)
             or accumulated_time_s > configured_step_s
@@ -877,19 +908,21 @@ def downsample_imu(
 ) -> ArrayPair:
     """Return rotation (rad) and velocity change (m/s) of each prediction step from IMU samples.
 
-    The velocity change is in the body frame at the end of the step.
+    The velocity change is in the body frame at the end of the step. The rotations in a step are
+    small, so rotation vectors are added, and a rotation by φ changes a vector v by φ × v.
     """
     start_indices = np.append(0, step_end_indices[:-1])
     used_count = step_end_indices[-1]
     velocity_increments = velocity_increments[:used_count]
     rotation_rad = cumulative_sums(rotation_vectors[:used_count])
+    # Each velocity increment belongs to the attitude in the middle of its interval
     middle_rotation_rad = 0.5 * (rotation_rad[:-1] + rotation_rad[1:])
     step_end_rotation_rad = np.repeat(
         rotation_rad[step_end_indices], step_end_indices - start_indices, axis=0
     )
-    rotated_increments = velocity_increments - np.cross(
+    rotated_velocity_increments = velocity_increments - np.cross(
         step_end_rotation_rad - middle_rotation_rad, velocity_increments
     )
     return rotation_rad[step_end_indices] - rotation_rad[start_indices], np.add.reduceat(
-        rotated_increments, start_indices, axis=0
+        rotated_velocity_increments, start_indices, axis=0
     )

@@ -12,13 +12,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array
-from px4fuse.core.record import NOT_IN_JSON, Count, NotInJson, NotNegative, Record, Span
-from px4fuse.ekf2.filter_recursion import FilterConfiguration
+from px4fuse.core.record import NOT_IN_JSON, Count, NonNegativeFloat, NotInJson, Record, Span
+from px4fuse.ekf2.filter_batch import FilterConfiguration
 from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import (
     Ekf2Model,
@@ -46,21 +47,24 @@ NO_TRUTH_OVERLAP = Unavailable(
     "ground truth and replay do not overlap in time",
     "Record ground truth during the whole flight.",
 )
-# Properties in which KF and EKF2 differ
-SAMPLE_TIMES_PROPERTY = "sample times and time steps"
-TIMESTAMPS_PROPERTY = "timestamps and delay"
-MEASUREMENT_NOISE_PROPERTY = "measurement noise"
-ACCELEROMETER_BIAS_PROPERTY = "accelerometer bias state"
-PROCESS_NOISE_PROPERTY = "process noise"
-ATTITUDE_PROPERTY = "attitude and gyro bias states"
-MAGNETOMETER_PROPERTY = "magnetometer"
-GNSS_VELOCITY_PROPERTY = "GNSS velocity"
-FLOW_PROPERTY = "optical flow"
-VISION_PROPERTY = "external vision"
-REJECTION_PROPERTY = "rejections and resets"
-OUTPUT_PREDICTOR_PROPERTY = "output predictor"
-# Properties that add an aiding source, by PX4's name of the source
-PROPERTY_BY_ADDITIONAL_AID = {FLOW.name: FLOW_PROPERTY, EV_POS.name: VISION_PROPERTY}
+# Names of the replaced properties, in which KF and EKF2 differ
+SAMPLE_TIMES_REPLACEMENT_NAME = "sample times and time steps"
+TIMESTAMPS_REPLACEMENT_NAME = "timestamps and delay"
+MEASUREMENT_NOISE_REPLACEMENT_NAME = "measurement noise"
+ACCELEROMETER_BIAS_REPLACEMENT_NAME = "accelerometer bias state"
+PROCESS_NOISE_REPLACEMENT_NAME = "process noise"
+ATTITUDE_REPLACEMENT_NAME = "attitude and gyro bias states"
+MAGNETOMETER_REPLACEMENT_NAME = "magnetometer"
+GNSS_VELOCITY_REPLACEMENT_NAME = "GNSS velocity"
+FLOW_REPLACEMENT_NAME = "optical flow"
+VISION_REPLACEMENT_NAME = "external vision"
+REJECTION_REPLACEMENT_NAME = "rejections and resets"
+OUTPUT_PREDICTOR_REPLACEMENT_NAME = "output predictor"
+# Replacements that add an aiding source, by PX4's name of the source
+REPLACEMENT_NAME_BY_ADDITIONAL_AID = {
+    FLOW.name: FLOW_REPLACEMENT_NAME,
+    EV_POS.name: VISION_REPLACEMENT_NAME,
+}
 
 
 class PropertyReplacement(Record, kw_only=True):
@@ -79,12 +83,12 @@ class PropertyReplacement(Record, kw_only=True):
     name: str
     position_mean_square_m2: float
     velocity_mean_square_m2_s2: float
-    position_moved_m: NotNegative
+    position_moved_m: NonNegativeFloat
     moved_at_s: float
-    position_rmse_to_truth_m: NotNegative | None = None
+    position_rmse_to_truth_m: NonNegativeFloat | None = None
 
 
-class RejectionRun(Record, kw_only=True):
+class RejectionSeries(Record, kw_only=True):
     """Longest series of successive position samples that EKF2 rejected in flight.
 
     Attributes
@@ -97,8 +101,8 @@ class RejectionRun(Record, kw_only=True):
 
     start_s: float
     samples: Count
-    duration_s: NotNegative
-    distance_m: NotNegative
+    duration_s: NonNegativeFloat
+    distance_m: NonNegativeFloat
 
 
 class DifferenceOutsideReplay(Record):
@@ -107,7 +111,7 @@ class DifferenceOutsideReplay(Record):
     ``at_s`` is the time of this difference. The EKF2 replay does not cover the whole flight.
     """
 
-    maximum_m: NotNegative
+    maximum_m: NonNegativeFloat
     at_s: float
 
 
@@ -139,14 +143,14 @@ class DifferenceExplanation(Record, kw_only=True):
     """
 
     count: Count
-    position_mean_square_m2: NotNegative
-    velocity_mean_square_m2_s2: NotNegative
+    position_mean_square_m2: NonNegativeFloat
+    velocity_mean_square_m2_s2: NonNegativeFloat
     steps: tuple[PropertyReplacement, ...]
-    unexplained_mean_square_m2: NotNegative
-    unexplained_velocity_mean_square_m2_s2: NotNegative
-    position_rmse_to_truth_m: Mapping[str, NotNegative | Unavailable]
+    unexplained_mean_square_m2: NonNegativeFloat
+    unexplained_velocity_mean_square_m2_s2: NonNegativeFloat
+    position_rmse_to_truth_m: Mapping[str, NonNegativeFloat | Unavailable]
     spans_s: Spans
-    longest_rejection: RejectionRun | None = None
+    longest_rejection: RejectionSeries | None = None
     outside: DifferenceOutsideReplay | None = None
     corrected: Mapping[str, float] = {}
     sentences: tuple[str, ...] = ()
@@ -200,14 +204,17 @@ def explain_difference_by_replacements(
             "Analyse a segment in which EKF2 fused the position source (--start, --end).",
         )
     state_span_s = float(state_times_s[0]), float(state_times_s[-1])
-    property_names = (*configurations, OUTPUT_PREDICTOR_PROPERTY)
+    replacement_names = (*configurations, OUTPUT_PREDICTOR_REPLACEMENT_NAME)
+    # Only the replays of the last two properties contain EKF2's rejections
+    *_, last_property_without_gate, _, _ = replacement_names
+    # Position and velocity of each track along each axis
     states_by_track = []
     # Tracks are computed one at a time, to limit the memory
     tracks = chain(
         fusion_horizon_tracks,
         (baseline_replay.delayed_state, baseline_replay.published_state, ekf2.state),
     )
-    for property_name, track in zip((*property_names, "EKF2 as logged"), tracks, strict=True):
+    for replacement_name, track in zip((*replacement_names, "EKF2 as logged"), tracks, strict=True):
         states_by_track.append(
             [
                 [
@@ -217,11 +224,9 @@ def explain_difference_by_replacements(
                 for run in kf_runs.values()
             ]
         )
-        # Last replay that fuses every sample; the replays of the last two properties contain EKF2's
-        # rejections
-        if property_name == property_names[-3]:
+        if replacement_name == last_property_without_gate:
             replay_track_without_gate = track
-    spans = Segment(*state_span_s, "").cut(evaluated_spans)
+    spans = Segment(*state_span_s, "").clip_spans(evaluated_spans)
     longest_rejection = _find_longest_rejection(
         baseline_replay, replay_track_without_gate, state_span_s, evaluated_spans
     )
@@ -233,7 +238,7 @@ def explain_difference_by_replacements(
         explanations[axis] = _explain_difference_along_axis(
             model.flight,
             kf_run.axis.direction,
-            property_names,
+            replacement_names,
             state_times_s,
             np.array([kf_state, *axis_components]),
             spans,
@@ -245,11 +250,11 @@ def explain_difference_by_replacements(
 def _explain_difference_along_axis(
     flight: Flight,
     direction: Array,
-    property_names: Sequence[str],
+    replacement_names: Sequence[str],
     times_s: Array,
     states_by_track: Array,
     spans_s: Spans,
-    longest_rejection: RejectionRun | None,
+    longest_rejection: RejectionSeries | None,
 ) -> DifferenceExplanation:
     """Divide the mean square difference KF - EKF2 along one axis among k properties.
 
@@ -273,7 +278,7 @@ def _explain_difference_along_axis(
             position_rmse_to_truth_m=rmse_m,
         )
         for name, (position_reduction, velocity_reduction), position_change_m, rmse_m in zip(
-            property_names,
+            replacement_names,
             (mean_square_differences[:-1] - mean_square_differences[1:]).tolist(),
             position_change,
             rmse_by_track[1:-1],
@@ -311,65 +316,63 @@ def make_replacement_configurations(
     configuration replaces one more property of KF by that of EKF2. The keys are the names of the
     replaced properties.
     """
-    logged_settings = inputs.settings
-    aid = inputs.aid
-    acceleration_noise_m_s2 = kf_settings.sigma_a_m_s2 * math.sqrt(
-        kf_settings.dt_s / inputs.mean_step_s
-    )
-    settings_with_kf_process_noise = {**logged_settings, "EKF2_ACC_NOISE": acceleration_noise_m_s2}
-    settings_with_kf_noises = {**settings_with_kf_process_noise, aid.noise: kf_settings.sigma_z_m}
+    logged_settings, aid = inputs.settings, inputs.aid
+    kf_process_noise = {
+        "EKF2_ACC_NOISE": kf_settings.sigma_a_m_s2
+        * math.sqrt(kf_settings.dt_s / inputs.mean_step_s)
+    }
+    kf_noises = {**kf_process_noise, aid.noise: kf_settings.sigma_z_m}
     # The delay is already subtracted from KF's GNSS times, but not from the replay's timestamps
     applied_delay_s = logged_settings[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
-    time_offset_s = kf_settings.clock_offset_s - applied_delay_s
-    settings_without_lever_arm = {**settings_with_kf_noises, **dict.fromkeys(aid.lever_arm, 0.0)}
     replayed_aids = list_modelled_aids(inputs)[1:]
     property_by_aid = {
-        aid: name for aid, name in PROPERTY_BY_ADDITIONAL_AID.items() if aid in replayed_aids
+        name: replacement_name
+        for name, replacement_name in REPLACEMENT_NAME_BY_ADDITIONAL_AID.items()
+        if name in replayed_aids
     }
     additional_aids = [*property_by_aid]
-    kf_configuration = FilterConfiguration(
-        settings_with_kf_noises,
+    configuration = FilterConfiguration(
+        {**logged_settings, **kf_noises, **dict.fromkeys(aid.lever_arm, 0.0)},
         estimates_biases=False,
         estimates_attitude=False,
         uses_reported_noise=False,
         has_gate=False,
         fuses_velocity=False,
         disable_time_s_by_aid=dict.fromkeys((MAG.name, *additional_aids), 0.0),
+        timestamp_offset_s=kf_settings.clock_offset_s - applied_delay_s,
     )
-    measurement_noise_configuration = replace(
-        kf_configuration, settings=settings_with_kf_process_noise, uses_reported_noise=True
-    )
-    process_noise_configuration = replace(
-        measurement_noise_configuration, settings=logged_settings, estimates_biases=True
-    )
-    configuration = replace(process_noise_configuration, estimates_attitude=True)
-    configurations = {
-        SAMPLE_TIMES_PROPERTY: replace(
-            kf_configuration, settings=settings_without_lever_arm, timestamp_offset_s=time_offset_s
-        ),
-        TIMESTAMPS_PROPERTY: kf_configuration,
-        MEASUREMENT_NOISE_PROPERTY: measurement_noise_configuration,
-        ACCELEROMETER_BIAS_PROPERTY: replace(
-            measurement_noise_configuration, estimates_biases=True
-        ),
-        PROCESS_NOISE_PROPERTY: process_noise_configuration,
-        ATTITUDE_PROPERTY: configuration,
+    # Changed fields of the configuration, in the order of the replacements
+    replacements: dict[str, dict[str, Any]] = {
+        TIMESTAMPS_REPLACEMENT_NAME: {
+            "settings": {**logged_settings, **kf_noises},
+            "timestamp_offset_s": None,
+        },
+        MEASUREMENT_NOISE_REPLACEMENT_NAME: {
+            "settings": {**logged_settings, **kf_process_noise},
+            "uses_reported_noise": True,
+        },
+        ACCELEROMETER_BIAS_REPLACEMENT_NAME: {"estimates_biases": True},
+        PROCESS_NOISE_REPLACEMENT_NAME: {"settings": logged_settings},
+        ATTITUDE_REPLACEMENT_NAME: {"estimates_attitude": True},
     }
     if MAG.name in replayed_aids:
-        configurations[MAGNETOMETER_PROPERTY] = configuration = replace(
-            configuration, disable_time_s_by_aid=dict.fromkeys(additional_aids, 0.0)
-        )
+        replacements[MAGNETOMETER_REPLACEMENT_NAME] = {
+            "disable_time_s_by_aid": dict.fromkeys(additional_aids, 0.0)
+        }
     if GNSS_VEL.name in replayed_aids:
-        configurations[GNSS_VELOCITY_PROPERTY] = configuration = replace(
-            configuration, fuses_velocity=True
-        )
+        replacements[GNSS_VELOCITY_REPLACEMENT_NAME] = {"fuses_velocity": True}
     for next_index, name in enumerate(property_by_aid.values(), start=1):
-        configurations[name] = configuration = replace(
-            configuration, disable_time_s_by_aid=dict.fromkeys(additional_aids[next_index:], 0.0)
-        )
-    return configurations | {
-        REJECTION_PROPERTY: FilterConfiguration(logged_settings, uses_logged_decisions=True)
-    }
+        replacements[name] = {
+            "disable_time_s_by_aid": dict.fromkeys(additional_aids[next_index:], 0.0)
+        }
+    configurations = {SAMPLE_TIMES_REPLACEMENT_NAME: configuration}
+    for name, changes in replacements.items():
+        configuration = replace(configuration, **changes)
+        configurations[name] = configuration
+    configurations[REJECTION_REPLACEMENT_NAME] = FilterConfiguration(
+        logged_settings, uses_logged_decisions=True
+    )
+    return configurations
 
 
 def _find_longest_rejection(
@@ -377,18 +380,24 @@ def _find_longest_rejection(
     fusion_horizon_track_without_gate: pd.DataFrame,
     span: Span,
     spans_s: Spans,
-) -> RejectionRun | None:
+) -> RejectionSeries | None:
+    """Return the longest series of rejected positions in the time ``span`` and in ``spans_s``.
+
+    The replays with and without rejections, ``baseline_replay`` and
+    ``fusion_horizon_track_without_gate``, give the effect of the series on the position.
+    """
     updates = rows_inside(baseline_replay.updates, spans_s)
     updates = updates[updates["fused_at_s"].between(*span)]
     is_rejected = updates["rejected"].to_numpy() > 0
     fusion_times_s = updates["fused_at_s"].to_numpy()
     if not is_rejected.any():
         return None
-    # A series of rejections ends at the next fused sample
+    # Rows of the first rejected sample, and of the next fused sample, of each series
     change_rows = np.flatnonzero(np.diff(is_rejected, prepend=False, append=False))
     run_starts, run_ends = change_rows.reshape(-1, 2).T
     longest_index = int(np.argmax(run_ends - run_starts))
     begin_s = fusion_times_s[run_starts[longest_index]]
+    # The last series may continue to the end of the flight
     end_s = fusion_times_s[min(run_ends[longest_index], len(fusion_times_s) - 1)]
     fusion_horizon_track = baseline_replay.delayed_state.loc[begin_s:end_s]
     position_difference = [
@@ -400,7 +409,7 @@ def _find_longest_rejection(
         )
         for column in Columns.POSITION[:2]
     ]
-    return RejectionRun(
+    return RejectionSeries(
         start_s=float(begin_s),
         samples=int(run_ends[longest_index] - run_starts[longest_index]),
         duration_s=float(end_s - begin_s),

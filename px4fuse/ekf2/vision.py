@@ -8,18 +8,15 @@ Sources: PX4-Autopilot ``EKF/aid_sources/external_vision`` (``ev_pos_control.cpp
 ``EKF/ev_pos_control.cpp``), ``EKF/control.cpp`` (vision is fused after GNSS and heights).
 """
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.ekf2.bias import BiasEstimator
+from px4fuse.ekf2.filter_batch import FilterBatch, FilterConfiguration
 from px4fuse.ekf2.heights import MIN_INNOVATION_GATE, MIN_MEASUREMENT_NOISE_SIGMA
-from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.intervals import MAX_DELAY_BEHIND_HORIZON_S
 from px4fuse.ekf2.replay_segments import (
-    ReplaySegment,
     group_samples_by_event,
     make_update_table,
     stack_samples,
@@ -35,34 +32,35 @@ MAX_SAMPLE_GAP_S = 0.4
 MAX_REJECTION_DURATION_S = 1.0
 
 
-def group_vision_by_event(
-    inputs: ReplayInputs,
-    segment: ReplaySegment,
-    event_steps: IntArray,
-    settings: Mapping[str, float],
-    horizon_s: float,
+def _group_vision_by_event(
+    batch: FilterBatch, event_steps: IntArray, configuration: FilterConfiguration
 ) -> Array:
-    """Group the vision samples by event: each event fuses the samples since the previous event.
+    """Group the vision samples of one filter by event.
+
+    Each event fuses the samples since the previous event.
 
     Return an array of shape (8, k, events) for up to k samples per event. Rows: position north and
     east (m), age, measurement time, fusion time (s), reported variances north and east (m²), and 1
     for a sample (0 for padding).
     """
-    vision_positions = inputs.vision_positions
-    time_s = segment.time_s
+    inputs, segment, settings = batch.inputs, batch.segment, configuration.settings
+    vision_positions, time_s = inputs.vision_positions, segment.time_s
     assert vision_positions is not None
     measurement_times_s = (
         vision_positions.timestamp_s - settings[EV_POS.delay] * 1e-3 - 0.5 * inputs.mean_step_s
     )
     earliest_fusion_times_s = np.maximum(
-        measurement_times_s, vision_positions.arrival_s - horizon_s
+        measurement_times_s,
+        vision_positions.arrival_s - configuration.compute_delays(inputs).horizon_s,
     )
+    # EKF2 fuses a late sample when it arrives, after the earlier samples. 1e-9: rounding errors
     step_index = np.maximum.accumulate(np.searchsorted(time_s, earliest_fusion_times_s - 1e-9))
     is_usable = (
         (step_index > 0)
         & (step_index < len(time_s))
         & (earliest_fusion_times_s < measurement_times_s + MAX_DELAY_BEHIND_HORIZON_S)
     )
+    # NaN: vision is disabled
     is_usable &= np.isfinite(vision_positions.position_m[:, 0])
     # EKF2 fuses only the newer of two samples in one prediction step
     is_usable[:-1] &= step_index[1:] > step_index[:-1]
@@ -84,17 +82,6 @@ def group_vision_by_event(
 class VisionFilter:
     """Fusion of vision positions as in EKF2, for several filter configurations at once.
 
-    Parameters
-    ----------
-    samples_by_configuration : sequence of ndarray, shape (8, k, events)
-        Result of :func:`group_vision_by_event` for each filter configuration.
-    is_enabled_by_aid : mapping from PX4's name of a source to ndarray of bool, (events, filters)
-    parameters : mapping from parameter name to ndarray, shape (filters,)
-    has_gate : ndarray of bool, shape (filters,)
-        False to fuse every sample.
-    uses_reported_noise : ndarray of bool, shape (filters,)
-        False to ignore the reported variances.
-
     Attributes
     ----------
     update_records : ndarray, shape (events, k, 7, filters)
@@ -105,16 +92,17 @@ class VisionFilter:
         Time of the last position fusion or reset.
     """
 
-    def __init__(
-        self,
-        segment: ReplaySegment,
-        samples_by_configuration: Sequence[Array],
-        is_enabled_by_aid: Mapping[str, BoolArray],
-        parameters: Mapping[str, Array],
-        has_gate: BoolArray,
-        uses_reported_noise: BoolArray,
-    ) -> None:
-        samples = stack_samples(samples_by_configuration)
+    def __init__(self, batch: FilterBatch) -> None:
+        segment, parameters = batch.segment, batch.parameters
+        is_enabled_by_aid = batch.is_enabled_by_aid
+        samples = stack_samples(
+            [
+                _group_vision_by_event(batch, event_steps, configuration)
+                for event_steps, configuration in zip(
+                    batch.event_steps.T, batch.configurations, strict=True
+                )
+            ]
+        )
         self.position_m = np.moveaxis(samples[:2], 0, -1)
         self.age_s, self.measurement_times_s, self.fusion_time_s = samples[2:5]
         _, sample_count, event_count, configuration_count = samples.shape
@@ -123,11 +111,11 @@ class VisionFilter:
         has_sample = (samples[7] > 0.0) & is_enabled_by_aid[EV_POS.name]
         # Samples of the same prediction step as GNSS (age 0) are fused after GNSS, as in EKF2
         self.has_sample = [has_sample & (self.age_s > 0.0), has_sample & (self.age_s == 0.0)]
-        self.has_gate = has_gate
+        self.has_gate = batch.has_gate
         self.is_gnss_off = ~is_enabled_by_aid[GNSS_POS.name]
         self.gate_squared = np.maximum(parameters[EV_POS.gate], MIN_INNOVATION_GATE)[:, None] ** 2
         reported_variance = samples[5:7] * (
-            uses_reported_noise & (parameters[EV_POS.noise_mode_parameter] != 1.0)
+            batch.uses_reported_noise & (parameters[EV_POS.noise_mode_parameter] != 1.0)
         )
         min_variance = np.maximum(
             np.maximum(parameters[EV_POS.noise], MIN_MEASUREMENT_NOISE_SIGMA) ** 2,
@@ -173,6 +161,7 @@ class VisionFilter:
             age_s, fusion_time_s, R_m2 = (
                 array[sample_index, event] for array in (self.age_s, self.fusion_time_s, self.R_m2)
             )
+            # 1. Innovation. The sample measured an earlier position: position - age_s · velocity
             HP = P[:, HORIZONTAL_POSITION] - age_s[:, None, None] * P[:, HORIZONTAL_VELOCITY]
             HPH = (
                 HP[:, :, HORIZONTAL_POSITION] - age_s[:, None, None] * HP[:, :, HORIZONTAL_VELOCITY]
@@ -193,6 +182,7 @@ class VisionFilter:
                 is_bias_updated[:, None],
             )
             S = predicted_variance + R
+            # 2. Decision: fuse, reject or restart
             has_fusion_restarted = (time_since_sample_s > MAX_SAMPLE_GAP_S) | (
                 is_gnss_off != self.was_gnss_off
             )
@@ -221,6 +211,7 @@ class VisionFilter:
             )
             is_evaluated = is_fused | is_outside_gate | is_position_reset
             self.update_records[event, sample_index] = np.where(is_evaluated, update_record, np.nan)
+            # 3. Update of the state, or reset of the position
             K = (np.linalg.inv(HPH + R[:, :, None] * np.eye(2)) @ HP).transpose(0, 2, 1)
             K *= is_fused[:, None, None]
             x = x + (K @ nu[:, :, None])[:, :, 0]
@@ -236,6 +227,7 @@ class VisionFilter:
                 np.where(is_gnss_off[:, None], R_m2, R),
             )
             self.position_reset_m[event] += position_reset_m
+            # 4. Bias, and times of the last sample, attempt and fusion
             # If the fusion of vision restarts during GNSS fusion, EKF2 sets the vision bias so that
             # vision agrees with EKF2's position
             is_bias_initialised = is_restarting & ~is_position_reset

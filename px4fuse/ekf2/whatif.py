@@ -10,8 +10,8 @@ from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
 from px4fuse.core.arrays import Array
-from px4fuse.core.record import Count, NotNegative, Record, Share, one_line_repr
-from px4fuse.ekf2.heights import HEIGHT_SENSORS
+from px4fuse.core.record import Count, NonNegativeFloat, Record, Share, one_line_repr
+from px4fuse.ekf2.height_samples import HEIGHT_SENSORS
 from px4fuse.ekf2.inputs import find_horizontal_reset_times_s
 from px4fuse.ekf2.model import (
     Ekf2Model,
@@ -21,8 +21,8 @@ from px4fuse.ekf2.model import (
 )
 from px4fuse.ekf2.replay import (
     HORIZONTAL_AXES,
-    Agreement,
     Ekf2Replay,
+    ReplayAgreement,
     compute_rmse_to_truth,
     interpolate_component,
     is_inside_spans,
@@ -72,10 +72,10 @@ ADDED_POSITION_SIGMA_M = 0.002
 # Number of repeated replays with added position noise
 REPLAYS_WITH_ADDED_NOISE = 4
 # A replay with a larger rejected fraction is repeated with added position noise
-MIN_REJECTED_FRACTION = 0.02
+MIN_REJECTED_SAMPLE_FRACTION = 0.02
 # Above this rejected fraction, the statistics of a replay are not predictable: they depend on the
 # rejection of single samples
-MAX_REJECTED_FRACTION = 0.35
+MAX_REJECTED_SAMPLE_FRACTION = 0.35
 # EKF2 resets the height after this time (s) without height fusion (hgt_fusion_timeout_max,
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
@@ -93,27 +93,27 @@ class AxisStatistics(Record):
     ``sigma_p_median_m`` is the median reported σ. The mean NIS includes rejected samples.
     """
 
-    nis_mean: NotNegative
-    nis_band: tuple[NotNegative, NotNegative]
-    innovation_std_m: NotNegative
-    sigma_p_median_m: NotNegative | Unavailable
-    position_rmse_to_truth_m: NotNegative | Unavailable
+    nis_mean: NonNegativeFloat
+    nis_band: tuple[NonNegativeFloat, NonNegativeFloat]
+    innovation_std_m: NonNegativeFloat
+    sigma_p_median_m: NonNegativeFloat | Unavailable
+    position_rmse_to_truth_m: NonNegativeFloat | Unavailable
 
 
 class AidStatistics(Record):
     """Innovation statistics of one aiding source."""
 
-    nis_mean: NotNegative
-    nis_band: tuple[NotNegative, NotNegative]
-    innovation_std_m: NotNegative
+    nis_mean: NonNegativeFloat
+    nis_band: tuple[NonNegativeFloat, NonNegativeFloat]
+    innovation_std_m: NonNegativeFloat
     rejected_fraction: Share
-    longest_without_fusion_s: NotNegative
+    longest_without_fusion_s: NonNegativeFloat
 
     @property
     def is_predictable(self) -> bool:
         """True if the model can predict EKF2: few rejections, and no height reset."""
         has_reset = self.longest_without_fusion_s > HEIGHT_TIMEOUT_S
-        return not has_reset and self.rejected_fraction <= MAX_REJECTED_FRACTION
+        return not has_reset and self.rejected_fraction <= MAX_REJECTED_SAMPLE_FRACTION
 
 
 class Ekf2Statistics(Record, kw_only=True, omit_defaults=False):
@@ -145,12 +145,12 @@ class Ekf2Statistics(Record, kw_only=True, omit_defaults=False):
     east: AxisStatistics
     samples: Count
     rejected_fraction: Share
-    longest_without_fusion_s: NotNegative | Unavailable
+    longest_without_fusion_s: NonNegativeFloat | Unavailable
     resets: Count
     heading_error_mean_deg: float | Unavailable = HEADING_NOT_REPLAYED
     heights: Mapping[str, AidStatistics] = {}
     others: Mapping[str, AidStatistics] = {}
-    height_rmse_to_truth_m: NotNegative | Unavailable = HEIGHT_NOT_REPLAYED
+    height_rmse_to_truth_m: NonNegativeFloat | Unavailable = HEIGHT_NOT_REPLAYED
     late: Count = 0
     lost: Count = 0
     is_predictable: bool = True
@@ -181,7 +181,7 @@ class WhatIf:
 
     Attributes
     ----------
-    agreement : Agreement
+    agreement : ReplayAgreement
         Agreement of the replay with the log.
     whatif : tuple of Ekf2Statistics
         Statistics with each set of changed parameters.
@@ -191,7 +191,7 @@ class WhatIf:
         Limitations of the replay.
     """
 
-    agreement: Agreement
+    agreement: ReplayAgreement
     logged: Ekf2Statistics
     replayed: Ekf2Statistics
     whatif: tuple[Ekf2Statistics, ...]
@@ -258,7 +258,7 @@ def what_if(
         agreement=model.agreement,
         logged=_summarise_log(flight, model.baseline_replay, spans_s),
         replayed=_summarise_replay(flight, model.baseline_replay, spans_s),
-        whatif=_mark_unpredictable(model, summaries, spans_s, disable_time_s_by_aid),
+        whatif=_mark_unpredictable_statistics(model, summaries, spans_s, disable_time_s_by_aid),
         evaluated_s=spans_s,
         notes=tuple(notes),
     )
@@ -294,7 +294,7 @@ def make_sweep_values(
     return [float(value) for value in sweep]
 
 
-def _mark_unpredictable(
+def _mark_unpredictable_statistics(
     model: Ekf2Model,
     summaries: Sequence[Ekf2Statistics],
     spans_s: Spans,
@@ -308,34 +308,29 @@ def _mark_unpredictable(
         summary
         for summary in summaries
         if summary.changed
-        and MIN_REJECTED_FRACTION < summary.rejected_fraction <= MAX_REJECTED_FRACTION
+        and MIN_REJECTED_SAMPLE_FRACTION < summary.rejected_fraction <= MAX_REJECTED_SAMPLE_FRACTION
     ]
     changes = [summary.changed for summary in uncertain_summaries]
-    summaries_by_seed = [
-        [
-            _summarise_replay(model.flight, replay, spans_s)
-            for replay in replay_with_settings(
+    summaries_by_seed = [uncertain_summaries]
+    if changes:
+        for seed in range(REPLAYS_WITH_ADDED_NOISE):
+            replays = replay_with_settings(
                 add_position_noise(model, ADDED_POSITION_SIGMA_M, seed),
                 changes,
                 disable_time_s_by_aid=disable_time_s_by_aid,
             )
-        ]
-        for seed in range(REPLAYS_WITH_ADDED_NOISE if changes else 0)
-    ]
+            summaries_by_seed.append(
+                [_summarise_replay(model.flight, replay, spans_s) for replay in replays]
+            )
     sensitive_changes = [
         repeated_summaries[0].changed
-        for repeated_summaries in zip(uncertain_summaries, *summaries_by_seed, strict=True)
+        for repeated_summaries in zip(*summaries_by_seed, strict=True)
         if not _results_agree(repeated_summaries)
     ]
     return tuple(
         replace(
             summary,
-            is_predictable=all(height.is_predictable for height in summary.heights.values())
-            and all(
-                other.rejected_fraction <= MAX_REJECTED_FRACTION
-                for other in summary.others.values()
-            )
-            and (not summary.changed or summary.rejected_fraction <= MAX_REJECTED_FRACTION)
+            is_predictable=_has_few_rejections(summary)
             and summary.changed not in sensitive_changes,
             without=disable_time_s_by_aid,
         )
@@ -343,22 +338,42 @@ def _mark_unpredictable(
     )
 
 
+def _has_few_rejections(summary: Ekf2Statistics) -> bool:
+    """Return True if EKF2 rejects so few samples that the model can predict the rejections.
+
+    The rejected positions of a replay with the logged parameters are not counted.
+    """
+    rejected_fractions = [aid.rejected_fraction for aid in summary.others.values()]
+    if summary.changed:
+        rejected_fractions.append(summary.rejected_fraction)
+    return max(rejected_fractions, default=0.0) <= MAX_REJECTED_SAMPLE_FRACTION and all(
+        height.is_predictable for height in summary.heights.values()
+    )
+
+
 def _results_agree(summaries: Sequence[Ekf2Statistics]) -> bool:
     """Return True if mean NIS, rejected fraction and RMSE of repeated replays hardly differ."""
     rejected_fractions = [summary.rejected_fraction for summary in summaries]
     rmses_m = [summary.position_rmse_to_truth_m for summary in summaries]
-    values_and_max_ratios = [
-        (
-            [summary.axes[axis].nis_mean for summary in summaries],
-            MAX_NIS_RATIO_BETWEEN_REPEATED_REPLAYS,
+    return (
+        np.ptp(rejected_fractions) <= MAX_REJECTED_FRACTION_RANGE_OF_REPLAYS
+        and _is_ratio_below(
+            MAX_RMSE_RATIO_BETWEEN_REPEATED_REPLAYS,
+            [rmse_m for rmse_m in rmses_m if isinstance(rmse_m, float)],
         )
-        for axis in HORIZONTAL_AXES
-    ]
-    known_rmses_m = [rmse_m for rmse_m in rmses_m if isinstance(rmse_m, float)]
-    values_and_max_ratios.append((known_rmses_m or [0.0], MAX_RMSE_RATIO_BETWEEN_REPEATED_REPLAYS))
-    return np.ptp(rejected_fractions) <= MAX_REJECTED_FRACTION_RANGE_OF_REPLAYS and all(
-        max(values) <= max_ratio * min(values) for values, max_ratio in values_and_max_ratios
+        and all(
+            _is_ratio_below(
+                MAX_NIS_RATIO_BETWEEN_REPEATED_REPLAYS,
+                [summary.axes[axis].nis_mean for summary in summaries],
+            )
+            for axis in HORIZONTAL_AXES
+        )
     )
+
+
+def _is_ratio_below(max_ratio: float, values: Sequence[float]) -> bool:
+    """Return True if largest ÷ smallest value is at most ``max_ratio``, or without values."""
+    return max(values, default=0.0) <= max_ratio * min(values, default=0.0)
 
 
 def _summarise_replay(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf2Statistics:
@@ -462,10 +477,11 @@ def _make_summary(
     """
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
+    # σ is compared at the times of the log, so replay and log have the same number of values
     logged_variance = ekf2.variance
     evaluated_times_s = rows_inside(ekf2.state, spans_s).index.to_numpy()
 
-    def error_m(direction: Array) -> float | Unavailable:
+    def compute_rmse_m(direction: Array) -> float | Unavailable:
         position_m = interpolate_component(
             published_track, Columns.POSITION, direction, evaluated_times_s
         )
@@ -485,7 +501,7 @@ def _make_summary(
         other_fields[axis] = AxisStatistics(
             *_compute_innovation_statistics(evaluated_updates, axis),
             median_sigma,
-            error_m(direction),
+            compute_rmse_m(direction),
         )
     aids = {
         name: _summarise_aid(evaluated, spans_s)
@@ -498,7 +514,7 @@ def _make_summary(
         other_fields["others"] = {EV_POS.name: vision}
     if other_aid_updates.keys() & HEIGHT_AID_NAMES:
         other_fields["heights"] = aids
-        other_fields["height_rmse_to_truth_m"] = error_m(np.eye(3)[2])
+        other_fields["height_rmse_to_truth_m"] = compute_rmse_m(np.eye(3)[2])
     return Ekf2Statistics(
         samples=len(evaluated_updates),
         rejected_fraction=float(evaluated_updates["rejected"].mean()),

@@ -25,10 +25,10 @@ from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import CONFIDENCE_LEVEL
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import SETTING_RANGES
-from px4fuse.filter.signals import AISLE, Acceleration, Axis, find_imu_gaps, weighted_sum
+from px4fuse.filter.signals import AISLE_AXIS, Acceleration, Axis, find_imu_gaps, weighted_sum
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
 from px4fuse.flight.model import Columns, PositionTrack, Unavailable
 from px4fuse.request import DT_S, SIGMA_A_M_S2, ComparisonRequest, command_line
 
@@ -259,9 +259,9 @@ def _format_ekf2_settings(analysis: Analysis) -> dict[str, str]:
     """Return the EKF2 parameters for noise, delay and gate of the position source, with units."""
     aid, logged_parameters = find_aid(analysis), analysis.flight.log.parameters
     return {
-        name: f"{logged_parameters[name]:.4g} {PARAMETERS[name].unit}".rstrip()
+        name: f"{logged_parameters[name]:.4g} {MODEL_PARAMETERS[name].unit}".rstrip()
         for name in (aid.noise, aid.delay, aid.gate)
-        if name in logged_parameters and name in PARAMETERS
+        if name in logged_parameters and name in MODEL_PARAMETERS
     }
 
 
@@ -271,8 +271,8 @@ def _make_command(request: ComparisonRequest, analysis: Analysis) -> str:
     The settings of KF are omitted; the web page appends them.
     """
     heading_deg = request.heading_deg
-    if heading_deg is None and AISLE in analysis.axes:
-        heading_deg = analysis[AISLE].heading_deg
+    if heading_deg is None and AISLE_AXIS in analysis.axes:
+        heading_deg = analysis[AISLE_AXIS].heading_deg
     request_without_kf_settings = msgspec.structs.replace(
         request,
         sigma_a_m_s2=SIGMA_A_M_S2,

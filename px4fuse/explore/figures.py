@@ -77,7 +77,7 @@ KF_BAND_STYLE: BokehStyle = {"fill_color": KF_COLOUR, "fill_alpha": 0.25}
 # Limit (±) of innovation ÷ √S for 95 % of the innovations of a consistent filter
 CONSISTENCY_LIMIT_IN_SQRT_S = 2.0
 # End (±) of the plot axis for innovation ÷ √S
-PLOT_LIMIT_IN_SQRT_S = 4.6
+INNOVATION_AXIS_LIMIT_IN_SQRT_S = 4.6
 
 
 def make_document_json(data: PageData) -> tuple[Any, dict[str, str]]:
@@ -153,7 +153,9 @@ def _make_plot(name: str, plot: Plot, data: PageData, shared_time_range: Range1d
 
 
 def _draw_innovations(plot_figure: Any, get_source: Callable[[str], ColumnDataSource]) -> None:
-    plot_figure.y_range = Range1d(start=-PLOT_LIMIT_IN_SQRT_S, end=PLOT_LIMIT_IN_SQRT_S)
+    plot_figure.y_range = Range1d(
+        start=-INNOVATION_AXIS_LIMIT_IN_SQRT_S, end=INNOVATION_AXIS_LIMIT_IN_SQRT_S
+    )
     consistent_band = BoxAnnotation(
         bottom=-CONSISTENCY_LIMIT_IN_SQRT_S,
         top=CONSISTENCY_LIMIT_IN_SQRT_S,
@@ -215,8 +217,8 @@ def _make_phase_plot() -> Any:
             line_dash=[2, 2],
         )
     )
-    before, now, mean = map(_make_data_source, ("before", "now", "mean"))
-    plot_figure.line("p", "v", source=before, line_dash=[6, 3], **KF_LINE_STYLE)
-    plot_figure.patch("p", "v", source=now, **KF_LINE_STYLE, **KF_BAND_STYLE)
-    plot_figure.scatter("p", "v", source=mean, size=7, fill_color=KF_COLOUR, line_color=None)
+    before_source, now_source, mean_source = map(_make_data_source, ("before", "now", "mean"))
+    plot_figure.line("p", "v", source=before_source, line_dash=[6, 3], **KF_LINE_STYLE)
+    plot_figure.patch("p", "v", source=now_source, **KF_LINE_STYLE, **KF_BAND_STYLE)
+    plot_figure.scatter("p", "v", source=mean_source, size=7, fill_color=KF_COLOUR, line_color=None)
     return plot_figure

@@ -9,7 +9,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.explore.data import ArrayEncoder, PageData, make_flight_data
 from px4fuse.explore.figures import TITLE_BY_TAB, make_document_json, select_plots
 from px4fuse.html.safe import (
-    clean_values,
+    clean_texts,
     compute_csp_hash,
     encode_safe_json,
     load_template,
@@ -54,7 +54,7 @@ def make_data_elements(
         "places": name_by_plot_id,
     }
     text_by_name = {
-        "content": encode_safe_json(clean_values(content, MAX_LOG_TEXT_LENGTH)),
+        "content": encode_safe_json(clean_texts(content, MAX_LOG_TEXT_LENGTH)),
         "document": encode_safe_json(bokeh_document),
         "arrays": encoder.text(),
     }

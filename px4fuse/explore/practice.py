@@ -15,11 +15,11 @@ import numpy as np
 from msgspec import structs
 
 from px4fuse.card.build import build_card
-from px4fuse.card.model import Card
+from px4fuse.card.model import DiagnosisCard
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.preparation import prepare_comparison_inputs
 from px4fuse.core.record import Record, read_toml
-from px4fuse.core.text import capitalise_first
+from px4fuse.core.text import capitalise_first_letter
 from px4fuse.diagnose import diagnose_comparison
 from px4fuse.explore.data import ArrayEncoder, make_flight_data
 from px4fuse.explore.page import make_data_elements, make_page_html
@@ -206,10 +206,10 @@ def _simulate_flight_data(
         "card": make_card_html(card, has_apply_buttons=True),
     }
     compressed_key = base64.b64encode(zlib.compress(json.dumps(answer_key).encode())).decode()
-    key_html = f'<script type="text/plain" id="key-{flight_index}">{compressed_key}</script>'
+    answer_key_html = f'<script type="text/plain" id="key-{flight_index}">{compressed_key}</script>'
     encoder = ArrayEncoder()
     data = make_flight_data(analysis, encoder)
-    return data, make_data_elements(data, analysis, encoder, f"-{flight_index}") + key_html
+    return data, make_data_elements(data, analysis, encoder, f"-{flight_index}") + answer_key_html
 
 
 def _describe_fault(fault: QuizFault, size: str, findings: tuple[Finding, ...]) -> dict[str, Any]:
@@ -234,13 +234,15 @@ def split_fault_size(size: str) -> list[str]:
     return [re.sub(r"(?<=\d)(?=[^\d.])", " ", part).replace("deg", "°") for part in size.split(",")]
 
 
-def _with_fault_headline(card: Card, fault_descriptions: Sequence[Mapping[str, Any]]) -> Card:
+def _with_fault_headline(
+    card: DiagnosisCard, fault_descriptions: Sequence[Mapping[str, Any]]
+) -> DiagnosisCard:
     if card.causes or not fault_descriptions:
         return card
     fault_text = "; ".join(f"{fault['fault']}: {fault['size']}" for fault in fault_descriptions)
     return structs.replace(
         card,
         severity="warning",
-        headline=capitalise_first(fault_text),
+        headline=capitalise_first_letter(fault_text),
         do_this=("px4fuse does not detect this fault. Look for its effect in the plots.",),
     )

@@ -14,7 +14,7 @@ from px4fuse.core.arrays import Array, ArrayPair
 from px4fuse.core.record import (
     Correlation,
     Count,
-    NotNegative,
+    NonNegativeFloat,
     PositiveFloat,
     Record,
     Share,
@@ -55,7 +55,7 @@ class NisVerdict(Record, kw_only=True):
 
     count: Count
     nis_mean: PositiveFloat
-    nis_band: tuple[NotNegative, NotNegative]
+    nis_band: tuple[NonNegativeFloat, NonNegativeFloat]
     sigma_ratio: PositiveFloat
     verdict: SigmaVerdict
 
@@ -83,7 +83,7 @@ class Consistency(NisVerdict, kw_only=True):
     """
 
     innovation_mean_m: float
-    innovation_std_m: NotNegative
+    innovation_std_m: NonNegativeFloat
     sqrt_s_median_m: PositiveFloat
     fraction_outside_two_sigma: Share
     fraction_outside_gate: Share
@@ -107,28 +107,28 @@ class Consistency(NisVerdict, kw_only=True):
         ``other_fields`` are the fields of a subclass.
         """
         is_usable = np.isfinite(innovation_m) & (innovation_variance_m2 > 0)
-        nu_m = innovation_m[is_usable]
+        usable_innovation_m = innovation_m[is_usable]
         variance_m2 = innovation_variance_m2[is_usable]
-        innovation_count = len(nu_m)
+        innovation_count = len(usable_innovation_m)
         if innovation_count < MIN_INNOVATIONS:
             return report_too_few_measurements(
                 "consistency test", innovation_count, MIN_INNOVATIONS
             )
-        if np.ptp(nu_m) == 0.0:
+        if np.ptp(usable_innovation_m) == 0.0:
             return Unavailable(
                 "consistency test",
                 "all innovations have the same value",
                 "Check the position source; then analyse a longer segment.",
             )
-        normalised_innovation = nu_m / np.sqrt(variance_m2)
-        std_m = float(np.std(nu_m, ddof=1))
-        mean_t_statistic = float(np.sqrt(innovation_count) * np.mean(nu_m) / std_m)
+        normalised_innovation = usable_innovation_m / np.sqrt(variance_m2)
+        std_m = float(np.std(usable_innovation_m, ddof=1))
+        mean_t_statistic = float(np.sqrt(innovation_count) * np.mean(usable_innovation_m) / std_m)
         lag_count = min(MAX_LJUNG_BOX_LAG_COUNT, innovation_count // 5)
         autocorrelations = compute_autocorrelation(normalised_innovation, lag_count)
         ljung_box_terms = autocorrelations**2 / (innovation_count - np.arange(1, lag_count + 1))
         return cls(
             **_compute_nis_verdict_fields(normalised_innovation**2),
-            innovation_mean_m=float(np.mean(nu_m)),
+            innovation_mean_m=float(np.mean(usable_innovation_m)),
             innovation_std_m=std_m,
             sqrt_s_median_m=float(np.median(np.sqrt(variance_m2))),
             fraction_outside_two_sigma=float(np.mean(np.abs(normalised_innovation) > 2.0)),

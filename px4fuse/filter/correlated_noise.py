@@ -10,9 +10,9 @@ With ground truth, τ is fitted to the position errors by restricted likelihood 
 Thompson 1971).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from itertools import product
 
 import numpy as np
@@ -20,12 +20,11 @@ import pandas as pd
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
-from px4fuse.core.arrays import Array, ArrayPair, compute_median_interval_s
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, compute_median_interval_s
 from px4fuse.filter.fitting import (
     NoiseFit,
     NoiseParameters,
     fit_constant_errors,
-    maximise_likelihood,
 )
 from px4fuse.filter.hypotheses import Jump, make_unit_steps
 from px4fuse.filter.imu_motion import MotionCache, PositionsAndImuMotion, compute_imu_motion
@@ -41,7 +40,7 @@ MAX_MEASUREMENTS = 2000
 # multiple of the median interval
 MAX_INTERVAL_TO_MEDIAN_INTERVAL_RATIO = 3.0
 # Time constants (s) in the coarse search for time-correlated noise
-COARSE_TAUS_S = (0.2, 0.6, 2.0, 6.0)
+COARSE_CORRELATION_TIMES_S = (0.2, 0.6, 2.0, 6.0)
 # Tested fractions of time-correlated noise in the variance SIGMA_Z², in the coarse search
 COARSE_CORRELATED_VARIANCE_FRACTIONS = (0.12, 0.35, 0.8)
 # Tested multiples of SIGMA_A in the coarse search
@@ -63,7 +62,7 @@ LOW_PASS_TAU_RANGE_S = (0.02, 3.0)
 # Tolerance of ln τ in the search for the time constant of a low pass
 LOG_TAU_TOLERANCE = 0.05
 # Maximum number of positions in the fit to ground truth, to limit computing time
-MAX_TRUTH_MEASUREMENTS = 300
+MAX_MEASUREMENTS_IN_TRUTH_FIT = 300
 # Minimum log-likelihood gain over white noise in the fit to ground truth
 MIN_TRUTH_LIKELIHOOD_GAIN_NATS = 5.0
 # If all position errors (m) are smaller, ground truth is a copy of the positions
@@ -73,7 +72,7 @@ MAX_TRUTH_TIME_DIFFERENCE_S = 0.1
 # Number of flight parts in the fit to ground truth; each has its own time offset
 FLIGHT_PART_COUNT = 12
 # Tested time constants (s) in the fit to ground truth
-TESTED_TAUS_S = np.geomspace(0.3, 80.0, 17)
+TESTED_CORRELATION_TIMES_S = np.geomspace(0.3, 80.0, 17)
 # Tested fractions of time-correlated errors in the error variance, in the fit to ground truth
 TESTED_CORRELATED_FRACTIONS = np.linspace(0.05, 0.999, 20)
 
@@ -126,7 +125,70 @@ class TimeCorrelatedNoise:
     low_pass_gain_nats: float
 
 
-def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
+# IMU motion of unfiltered positions, and a term to add to their negative log likelihood. The sum is
+# the negative log likelihood of the measured positions
+_UnfilteredMotion = tuple[PositionsAndImuMotion | Unavailable, float]
+
+
+def _undo_low_pass(
+    time_s: Array,
+    measured_m: Array,
+    is_outlier: BoolArray,
+    compute_motion: Callable[[Array, Array], PositionsAndImuMotion | Unavailable],
+    tau_s: float,
+) -> _UnfilteredMotion:
+    """Compute the positions before a low-pass filter with time constant ``tau_s``."""
+    interval_s = np.diff(time_s, prepend=time_s[0])
+    has_no_gap = (
+        interval_s < MAX_INTERVAL_TO_MEDIAN_INTERVAL_RATIO * np.median(interval_s[1:])
+    ) & (interval_s > 0.0)
+    rho = np.zeros(len(time_s))
+    if tau_s:
+        rho[has_no_gap] = np.exp(-interval_s[has_no_gap] / tau_s)
+    previous_position_m = np.concatenate([measured_m[:1], measured_m[:-1]])
+    unfiltered_m = (measured_m - rho[:, None] * previous_position_m) / (1.0 - rho)[:, None]
+    # The unfiltered position is computed from a position and the previous position. Exclude both
+    # unfiltered positions that are computed from an outlier
+    is_computed_from_outlier = is_outlier | (has_no_gap & np.append(False, is_outlier[:-1]))
+    motion = compute_motion(
+        time_s[~is_computed_from_outlier], unfiltered_m[~is_computed_from_outlier]
+    )
+    if isinstance(motion, Unavailable):
+        return motion, 0.0
+    # The first position of a segment sets the initial state, and is not part of the likelihood
+    is_used = np.isin(time_s, np.delete(motion.time_s, motion.segment_edges[:-1]))
+    return motion, measured_m.shape[1] * float(np.sum(np.log1p(-rho[is_used])))
+
+
+def _fit_low_pass(
+    undo_low_pass: Callable[[float], _UnfilteredMotion],
+    interval_s: float,
+    start_parameters: NoiseParameters,
+    white_noise_score: float,
+) -> SourceLowPass:
+    """Fit a low-pass filter to positions with the median interval ``interval_s``."""
+
+    def fit_noises(log_tau: float) -> tuple[float, float]:
+        """Return the score (-ln p) and SIGMA_Z for a given time constant."""
+        motion, minus_log_jacobian = undo_low_pass(float(np.exp(log_tau)))
+        # The same positions are used for each τ. The caller found their IMU motion
+        assert not isinstance(motion, Unavailable)
+        fit = motion.fit_noises(0.0, start_parameters)
+        return fit.compute_score() + minus_log_jacobian, fit.noise_parameters.sigma_z_m
+
+    low_log_tau, high_log_tau = np.log(LOW_PASS_TAU_RANGE_S)
+    log_tau = minimize_scalar(
+        lambda log_tau: fit_noises(log_tau)[0],
+        bounds=(low_log_tau, high_log_tau),
+        options={"xatol": LOG_TAU_TOLERANCE},
+    ).x
+    score, sigma_z_m = fit_noises(log_tau)
+    correlation = float(np.exp(-interval_s / np.exp(log_tau)))
+    lag_s = interval_s * correlation / (1.0 - correlation)
+    return SourceLowPass(correlation, lag_s, white_noise_score - score, sigma_z_m)
+
+
+def fit_time_correlation(
     flight: Flight,
     axes: tuple[Axis, ...],
     settings: Settings,
@@ -167,59 +229,25 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         measured_m = measured_m - np.outer(
             time_s >= jump.time_s, [step.value for step in jump.step_m]
         )
-    interval_s = np.diff(time_s, prepend=time_s[0])
-    is_outlier = np.isin(time_s, outlier_time_s)
-    is_interval_without_gap = (
-        interval_s < MAX_INTERVAL_TO_MEDIAN_INTERVAL_RATIO * np.median(interval_s[1:])
-    ) & (interval_s > 0.0)
-    directions = np.array([axis.direction for axis in axes])
-
-    def undo_low_pass(tau_s: float) -> tuple[PositionsAndImuMotion | Unavailable, float]:
-        """Compute the positions before a low-pass filter with time constant ``tau_s``.
-
-        Return the unfiltered positions with the IMU motion between them, and a term to add to their
-        negative log likelihood, so that the sum is that of the measured positions.
-        """
-        rho = np.zeros(len(time_s))
-        if tau_s:
-            rho[is_interval_without_gap] = np.exp(-interval_s[is_interval_without_gap] / tau_s)
-        previous_position_m = np.concatenate([measured_m[:1], measured_m[:-1]])
-        unfiltered_position_m = (measured_m - rho[:, None] * previous_position_m) / (1.0 - rho)[
-            :, None
-        ]
-        # The unfiltered position is computed from a position and the previous position. Exclude
-        # both unfiltered positions that are computed from an outlier
-        is_used_position = ~(
-            is_outlier | (is_interval_without_gap & np.append(False, is_outlier[:-1]))
-        )
-        motion_of_unfiltered_positions = compute_imu_motion(
-            flight,
-            time_s[is_used_position],
-            unfiltered_position_m[is_used_position],
-            directions=directions,
-            dt_s=settings.dt_s,
-            motion_cache=motion_cache,
-        )
-        if isinstance(motion_of_unfiltered_positions, Unavailable):
-            return motion_of_unfiltered_positions, 0.0
-        # The first position of a segment sets the initial state, and is not part of the likelihood
-        is_used = np.isin(
-            time_s,
-            np.delete(
-                motion_of_unfiltered_positions.time_s,
-                motion_of_unfiltered_positions.segment_edges[:-1],
-            ),
-        )
-        return motion_of_unfiltered_positions, len(axes) * float(np.sum(np.log1p(-rho[is_used])))
-
+    compute_motion = partial(
+        compute_imu_motion,
+        flight,
+        directions=np.array([axis.direction for axis in axes]),
+        dt_s=settings.dt_s,
+        motion_cache=motion_cache,
+    )
+    undo_low_pass = partial(
+        _undo_low_pass, time_s, measured_m, np.isin(time_s, outlier_time_s), compute_motion
+    )
     imu_motion, _ = undo_low_pass(0.0)
     if isinstance(imu_motion, Unavailable):
         return imu_motion
     tested_offsets_s = sorted({0.0, clock_offset_s})
     sigma_z_m = noise_parameters.sigma_z_m
-    downsampled_motion = imu_motion.downsample(COARSE_SEARCH_MEASUREMENT_COUNT)
-    # Default result: no low-pass filter
-    source_low_pass = SourceLowPass(0.0, 0.0, 0.0, sigma_z_m)
+    no_low_pass = SourceLowPass(correlation=0.0, lag_s=0.0, gain_nats=0.0, sigma_z_m=sigma_z_m)
+    no_correlation_found = Unavailable(
+        "time-correlated noise of the positions", "the position errors are not time-correlated", ""
+    )
     correlated_candidates = [
         replace(
             noise_parameters,
@@ -227,79 +255,53 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
             correlated_sigma_m=sigma_z_m * fraction**0.5,
             tau_s=tau,
         )
-        for fraction, tau in product(COARSE_CORRELATED_VARIANCE_FRACTIONS, COARSE_TAUS_S)
+        for fraction, tau in product(
+            COARSE_CORRELATED_VARIANCE_FRACTIONS, COARSE_CORRELATION_TIMES_S
+        )
     ]
     # Scores are -ln p of the positions, so the lowest score is the best
-    (
-        (coarse_white_noise_score, _),
-        (coarse_correlated_noise_score, correlated_noise_start_parameters),
-    ) = (
-        _search_coarse_grid(downsampled_motion, tested_offsets_s, candidate_parameters)
-        for candidate_parameters in ([noise_parameters], correlated_candidates)
-    )
-    no_correlation_found = Unavailable(
-        "time-correlated noise of the positions", "the position errors are not time-correlated", ""
+    downsampled_motion = imu_motion.downsample(COARSE_SEARCH_MEASUREMENT_COUNT)
+    search_coarse_grid = partial(_search_coarse_grid, downsampled_motion, tested_offsets_s)
+    coarse_white_noise_score, _ = search_coarse_grid([noise_parameters])
+    coarse_correlated_noise_score, correlated_start_parameters = search_coarse_grid(
+        correlated_candidates
     )
     is_sigma_z_small = sigma_z_m < MAX_SIGMA_Z_OF_LOW_PASS_SOURCE_M
     if (
         coarse_white_noise_score - coarse_correlated_noise_score < MIN_GAIN_FOR_FULL_FIT_NATS
         and not is_sigma_z_small
     ):
-        return source_low_pass, no_correlation_found
-    (white_noise_fit, _), (correlated_noise_fit, offset_s) = (
-        min(
-            (
-                (_fit_noises_at_offset(imu_motion, offset, start_parameters), offset)
-                for offset in tested_offsets_s
-            ),
-            key=lambda fit_and_offset: fit_and_offset[0].compute_score(),
-        )
-        for start_parameters in (noise_parameters, correlated_noise_start_parameters)
+        return no_low_pass, no_correlation_found
+    white_noise_fit, _ = _fit_noises_at_best_offset(imu_motion, tested_offsets_s, noise_parameters)
+    correlated_noise_fit, offset_s = _fit_noises_at_best_offset(
+        imu_motion, tested_offsets_s, correlated_start_parameters
     )
     white_noise_score = white_noise_fit.compute_score()
-    correlated_noise_score = correlated_noise_fit.compute_score()
     # A low-pass filter is fitted only if the noise is time-correlated or very small
-    is_correlated = white_noise_score - correlated_noise_score >= MIN_LIKELIHOOD_GAIN_NATS
+    gain_nats = white_noise_score - correlated_noise_fit.compute_score()
+    is_correlated = gain_nats >= MIN_LIKELIHOOD_GAIN_NATS
     if not (is_correlated or is_sigma_z_small):
-        return source_low_pass, no_correlation_found
-
-    def fit_low_pass(log_tau: float) -> tuple[float, NoiseParameters]:
-        motion_of_unfiltered_positions, minus_log_jacobian = undo_low_pass(float(np.exp(log_tau)))
-        # The same positions are used for each τ. undo_low_pass(0.0) found their IMU motion
-        assert not isinstance(motion_of_unfiltered_positions, Unavailable)
-        noise_fit = _fit_noises_at_offset(
-            motion_of_unfiltered_positions, 0.0, white_noise_fit.noise_parameters
-        )
-        return noise_fit.compute_score() + minus_log_jacobian, noise_fit.noise_parameters
-
-    low_log_tau, high_log_tau = np.log(LOW_PASS_TAU_RANGE_S)
-    log_tau = minimize_scalar(
-        lambda log_tau: fit_low_pass(log_tau)[0],
-        bounds=(low_log_tau, high_log_tau),
-        options={"xatol": LOG_TAU_TOLERANCE},
-    ).x
-    low_pass_score, low_pass_parameters = fit_low_pass(log_tau)
-    if low_pass_score < white_noise_score:
-        median_interval_s = compute_median_interval_s(time_s)
-        lag1_correlation = float(np.exp(-median_interval_s / np.exp(log_tau)))
-        lag_s = median_interval_s * lag1_correlation / (1.0 - lag1_correlation)
-        source_low_pass = SourceLowPass(
-            lag1_correlation,
-            lag_s,
-            white_noise_score - low_pass_score,
-            low_pass_parameters.sigma_z_m,
-        )
+        return no_low_pass, no_correlation_found
+    low_pass = _fit_low_pass(
+        undo_low_pass,
+        compute_median_interval_s(time_s),
+        white_noise_fit.noise_parameters,
+        white_noise_score,
+    )
+    source_low_pass = low_pass if low_pass.gain_nats > 0.0 else no_low_pass
     if not is_correlated:
         return source_low_pass, no_correlation_found
     fitted_parameters = correlated_noise_fit.noise_parameters
     return source_low_pass, TimeCorrelatedNoise(
-        fitted_parameters.tau_s,
-        fitted_parameters.tau_s,
-        np.inf,
-        fitted_parameters.correlated_sigma_m,
-        fitted_parameters.sigma_z_m,
-        white_noise_score - correlated_noise_score,
-        correlated_noise_score - low_pass_score + (TIME_OFFSET_PENALTY_NATS if offset_s else 0.0),
+        tau_s=fitted_parameters.tau_s,
+        low_s=fitted_parameters.tau_s,
+        high_s=np.inf,
+        slow_m=fitted_parameters.correlated_sigma_m,
+        white_m=fitted_parameters.sigma_z_m,
+        gain_nats=gain_nats,
+        low_pass_gain_nats=low_pass.gain_nats
+        - gain_nats
+        + (TIME_OFFSET_PENALTY_NATS if offset_s else 0.0),
     )
 
 
@@ -309,19 +311,24 @@ def fit_time_correlation_to_truth(
     outlier_time_s: Array,
     clock_offset_s: float,
     jumps: Sequence[Jump],
-    noise_from_imu: TimeCorrelatedNoise | Unavailable,
+    noise_fitted_with_imu: TimeCorrelatedNoise | Unavailable,
     low_pass: SourceLowPass,
 ) -> TimeCorrelatedNoise | Unavailable:
     """Fit time-correlated noise to the position errors against ground truth.
 
-    Frame errors and time offsets are removed from the errors. ``noise_from_imu`` is returned if its
-    log-likelihood gain over white noise is larger.
+    Frame errors and time offsets are removed from the errors. ``noise_fitted_with_imu`` is returned
+    if its log-likelihood gain over white noise is larger.
+
+    Model: the covariance of the errors is σ² ((1 - f) I + f C), with C = exp(-|Δt| / τ). For each
+    tested τ and f, the most likely σ² is known in closed form.
     """
     min_likelihood_gain_nats = MIN_TRUTH_LIKELIHOOD_GAIN_NATS
     low_pass_likelihood_gain_nats = low_pass.gain_nats
-    if isinstance(noise_from_imu, TimeCorrelatedNoise):
-        min_likelihood_gain_nats = max(MIN_TRUTH_LIKELIHOOD_GAIN_NATS, noise_from_imu.gain_nats)
-        low_pass_likelihood_gain_nats = noise_from_imu.low_pass_gain_nats
+    if isinstance(noise_fitted_with_imu, TimeCorrelatedNoise):
+        min_likelihood_gain_nats = max(
+            MIN_TRUTH_LIKELIHOOD_GAIN_NATS, noise_fitted_with_imu.gain_nats
+        )
+        low_pass_likelihood_gain_nats = noise_fitted_with_imu.low_pass_gain_nats
     true_track = pd.concat([truth["position_m"] for truth in truths], axis=1).dropna()
     measurement_time_s = np.setdiff1d(axes[0].measurement_time_s, outlier_time_s)
     measurement_time_s = measurement_time_s[
@@ -331,11 +338,11 @@ def fit_time_correlation_to_truth(
         >= 0
     ]
     measurement_time_s = measurement_time_s[
-        :: max(1, -(-len(measurement_time_s) // MAX_TRUTH_MEASUREMENTS))
+        :: max(1, -(-len(measurement_time_s) // MAX_MEASUREMENTS_IN_TRUTH_FIT))
     ]
     position_count = len(measurement_time_s)
     if position_count < MIN_MEASUREMENTS:
-        return noise_from_imu
+        return noise_fitted_with_imu
     measured_m = np.transpose(
         [axis.measurement_m[np.isin(axis.measurement_time_s, measurement_time_s)] for axis in axes]
     )
@@ -343,6 +350,7 @@ def fit_time_correlation_to_truth(
     true_m, true_velocity_m_s = (
         true_spline(measurement_time_s + clock_offset_s, order) for order in (0, 1)
     )
+    # A time offset of a flight part changes the position along each axis by offset · velocity
     is_in_flight_part = np.eye(FLIGHT_PART_COUNT)[
         FLIGHT_PART_COUNT * np.arange(position_count) // position_count
     ]
@@ -353,16 +361,15 @@ def fit_time_correlation_to_truth(
     systematic_error_columns = np.column_stack(
         [np.ones_like(measurement_time_s), true_m, time_offset_columns, jump_columns]
     )
+    # Projections of the errors on this basis do not depend on the systematic errors (restricted
+    # likelihood)
     basis_without_systematic_errors = np.linalg.qr(systematic_error_columns, mode="complete")[0][
         :, systematic_error_columns.shape[1] :
     ]
     residuals = basis_without_systematic_errors.T @ (measured_m - true_m)
     if np.abs(residuals).max() < MAX_RESIDUAL_OF_COPIED_TRUTH_M:
-        return noise_from_imu
-    half_axis_count_and_half_residual_count = 0.5 * np.array([len(axes), len(residuals)])
-    white_noise_score = (
-        half_axis_count_and_half_residual_count[1] * np.log(np.mean(residuals**2, axis=0)).sum()
-    )
+        return noise_fitted_with_imu
+    white_noise_score = 0.5 * len(residuals) * np.log(np.mean(residuals**2, axis=0)).sum()
 
     @cache
     def compute_scores_and_variances(tested_tau_s: float) -> ArrayPair:
@@ -378,19 +385,19 @@ def fit_time_correlation_to_truth(
         normalised_mean_squares = (
             ((eigenvectors.T @ residuals) ** 2).T @ (1.0 / relative_noise_variance) / len(residuals)
         )
-        scores = half_axis_count_and_half_residual_count @ [
-            np.log(relative_noise_variance).sum(axis=0),
-            np.log(normalised_mean_squares).sum(axis=0),
-        ]
+        log_determinant = np.log(relative_noise_variance).sum(axis=0)
+        log_variances = np.log(normalised_mean_squares).sum(axis=0)
+        scores = 0.5 * (len(axes) * log_determinant + len(residuals) * log_variances)
         return scores, normalised_mean_squares.mean(axis=0)
 
     # First test every fourth time constant: most flights have no time-correlated noise
     coarse_score = min(
-        compute_scores_and_variances(tau)[0].min() for tau in TESTED_TAUS_S[::4].tolist()
+        compute_scores_and_variances(tau)[0].min()
+        for tau in TESTED_CORRELATION_TIMES_S[::4].tolist()
     )
     if white_noise_score - coarse_score < min_likelihood_gain_nats / 2.0:
-        return noise_from_imu
-    scores_and_variances = [*map(compute_scores_and_variances, TESTED_TAUS_S.tolist())]
+        return noise_fitted_with_imu
+    scores_and_variances = [*map(compute_scores_and_variances, TESTED_CORRELATION_TIMES_S.tolist())]
     # Rows are time constants, columns time-correlated fractions of the variance
     scores, normalised_mean_squares = np.transpose(scores_and_variances, (1, 0, 2))
     tau_index, correlated_fraction_index = divmod(
@@ -399,33 +406,31 @@ def fit_time_correlation_to_truth(
     likelihood_gains_nats = white_noise_score - scores.min(axis=1)
     best_gain_nats = likelihood_gains_nats.max()
     if best_gain_nats < min_likelihood_gain_nats:
-        return noise_from_imu
+        return noise_fitted_with_imu
     first_tau_index, last_tau_index = np.flatnonzero(
         likelihood_gains_nats > best_gain_nats - MAX_LOG_LIKELIHOOD_DROP
     )[[0, -1]]
     # Each end of the 95 % interval of τ is between two tested values of τ: return the outer value
-    tau_s = np.append(TESTED_TAUS_S, np.inf)[
-        [tau_index, max(first_tau_index - 1, 0), last_tau_index + 1]
-    ]
-    fraction = TESTED_CORRELATED_FRACTIONS[correlated_fraction_index]
-    sigmas_m = np.sqrt(
-        normalised_mean_squares[tau_index, correlated_fraction_index]
-        * np.array([fraction, 1.0 - fraction])
-    )
+    taus_s = [*TESTED_CORRELATION_TIMES_S.tolist(), np.inf]
+    fraction = float(TESTED_CORRELATED_FRACTIONS[correlated_fraction_index])
+    variance_m2 = float(normalised_mean_squares[tau_index, correlated_fraction_index])
     return TimeCorrelatedNoise(
-        *np.r_[tau_s, sigmas_m, best_gain_nats, low_pass_likelihood_gain_nats].tolist()
+        tau_s=taus_s[tau_index],
+        low_s=taus_s[max(first_tau_index - 1, 0)],
+        high_s=taus_s[last_tau_index + 1],
+        slow_m=(variance_m2 * fraction) ** 0.5,
+        white_m=(variance_m2 * (1.0 - fraction)) ** 0.5,
+        gain_nats=float(best_gain_nats),
+        low_pass_gain_nats=low_pass_likelihood_gain_nats,
     )
 
 
-def _fit_noises_at_offset(
-    imu_motion: PositionsAndImuMotion, offset_s: float, start_parameters: NoiseParameters
-) -> NoiseFit:
-    return maximise_likelihood(
-        [imu_motion.make_positions_at_offset(offset_s)],
-        start_parameters,
-        imu_motion.measurement_weights,
-        fits_outliers=False,
-    )
+def _fit_noises_at_best_offset(
+    imu_motion: PositionsAndImuMotion, offsets_s: Sequence[float], start_parameters: NoiseParameters
+) -> tuple[NoiseFit, float]:
+    fits = {offset_s: imu_motion.fit_noises(offset_s, start_parameters) for offset_s in offsets_s}
+    best_offset_s = min(fits, key=lambda offset_s: fits[offset_s].compute_score())
+    return fits[best_offset_s], best_offset_s
 
 
 def _search_coarse_grid(

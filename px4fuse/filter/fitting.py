@@ -6,10 +6,13 @@ distribution with a larger σ (Tukey 1960), which is estimated by expectation ma
 A score is a negative log-likelihood (-ln p): lower is better.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from math import floor, log
+from math import exp, floor, log
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
@@ -38,8 +41,6 @@ MAX_FIT_ITERATIONS = 50
 OUTLIER_ITERATIONS_WITH_GIVEN_NOISES = 3
 # Minimum ratio of the outliers' σ to SIGMA_Z
 MIN_OUTLIER_SIGMA_RATIO = 3.0
-INITIAL_OUTLIER_FRACTION = 0.005
-INITIAL_OUTLIER_SIGMA_RATIO = 10.0
 MAX_OUTLIER_FRACTION = 0.4
 # To detect outliers, SIGMA_Z is limited to this multiple of a robust estimate, which is from the
 # median squared error
@@ -106,6 +107,11 @@ class NegativeLogLikelihood:
         The variance of a measurement is SIGMA_Z² / weight.
     sigma_z_m : float
         Approximate SIGMA_Z.
+
+    Notes
+    -----
+    The coordinates of the grid are ln(SIGMA_A / SIGMA_Z) and ln SIGMA_Z. One fit gives -ln p for
+    all SIGMA_Z with the same ratio, so few fits are necessary.
     """
 
     def __init__(
@@ -122,38 +128,23 @@ class NegativeLogLikelihood:
         )
 
         @cache
-        def fit_axes_with_sigma_ratio(log_sigma_ratio_grid_index: int) -> list[PositionFit]:
-            sigma_a_to_sigma_z_ratio = float(np.exp(GRID_NODE_SPACING * log_sigma_ratio_grid_index))
+        def fit_axes(ratio_index: int) -> list[PositionFit]:
+            sigma_a_m_s2 = exp(GRID_NODE_SPACING * ratio_index) * sigma_z_m
             return [
-                fit_with_sigma_ratios(
-                    [positions], [sigma_a_to_sigma_z_ratio], 0.0, measurement_weights, sigma_z_m
-                )[0]
+                fit_constant_errors(
+                    [positions], NoiseParameters(sigma_a_m_s2, sigma_z_m), measurement_weights
+                )
                 for positions in positions_by_axis
             ]
 
         @cache
-        def compute_scores_with_sigma_ratio(
-            log_sigma_ratio_grid_index: int, log_sigma_z_grid_index: int
-        ) -> Array:
-            sigma_factors = np.exp(GRID_NODE_SPACING * (log_sigma_z_grid_index + GRID_NODES))
+        def compute_scores_at_nodes(ratio_index: int, first_sigma_z_index: int) -> Array:
+            sigmas_z_m = np.exp(GRID_NODE_SPACING * (first_sigma_z_index + GRID_NODES))
             scores_by_axis = [
-                axis_fit.compute_scores(sigma_factors)[:, 0]
-                for axis_fit in fit_axes_with_sigma_ratio(log_sigma_ratio_grid_index)
+                axis_fit.compute_scores(sigmas_z_m / sigma_z_m)[:, 0]
+                for axis_fit in fit_axes(ratio_index)
             ]
             return np.asarray(np.sum(scores_by_axis, axis=0))
-
-        @cache
-        def compute_scores_at_nodes(
-            log_sigma_ratio_grid_index: int, log_sigma_z_grid_index: int
-        ) -> Array:
-            return np.array(
-                [
-                    compute_scores_with_sigma_ratio(
-                        log_sigma_ratio_grid_index + node, log_sigma_z_grid_index
-                    )
-                    for node in range(GRID_NODE_COUNT)
-                ]
-            )
 
         self._compute_scores_at_nodes = compute_scores_at_nodes
 
@@ -167,75 +158,47 @@ class NegativeLogLikelihood:
             return negative_log_likelihood(
                 self.positions_by_axis, noise_parameters, self.measurement_weights
             )
-        log_sigma_z_in_node_steps = log(noise_parameters.sigma_z_m) / GRID_NODE_SPACING
-        log_sigma_ratio_in_node_steps = (
-            log(noise_parameters.sigma_a_m_s2) / GRID_NODE_SPACING - log_sigma_z_in_node_steps
-        )
-        grid_nodes_below_value = (GRID_NODE_COUNT - 1) // 2
-        first_log_sigma_ratio_grid_index = (
-            floor(log_sigma_ratio_in_node_steps) - grid_nodes_below_value
-        )
-        first_log_sigma_z_grid_index = floor(log_sigma_z_in_node_steps) - grid_nodes_below_value
-        log_sigma_ratio_interpolation_weights = _compute_interpolation_weights(
-            log_sigma_ratio_in_node_steps - first_log_sigma_ratio_grid_index
-        )
-        log_sigma_z_interpolation_weights = _compute_interpolation_weights(
-            log_sigma_z_in_node_steps - first_log_sigma_z_grid_index
-        )
-        return float(
-            log_sigma_ratio_interpolation_weights
-            @ self._compute_scores_at_nodes(
-                first_log_sigma_ratio_grid_index, first_log_sigma_z_grid_index
-            )
-            @ log_sigma_z_interpolation_weights
-        )
+        log_sigma_z = log(noise_parameters.sigma_z_m)
+        log_ratio = log(noise_parameters.sigma_a_m_s2) - log_sigma_z
+        ratio_index, ratio_weights = _interpolate_between_nodes(log_ratio / GRID_NODE_SPACING)
+        sigma_z_index, sigma_z_weights = _interpolate_between_nodes(log_sigma_z / GRID_NODE_SPACING)
+        scores_at_nodes = [
+            self._compute_scores_at_nodes(ratio_index + node, sigma_z_index)
+            for node in range(GRID_NODE_COUNT)
+        ]
+        return float(ratio_weights @ scores_at_nodes @ sigma_z_weights)
 
 
-def _compute_interpolation_weights(position_in_node_steps: float) -> Array:
-    """Return the weights of barycentric interpolation (Berrut and Trefethen 2004)."""
-    node_distances = position_in_node_steps - GRID_NODES
-    if not node_distances.all():
-        return np.asarray(node_distances == 0.0, dtype=np.float64)
-    weights = BARYCENTRIC_WEIGHTS / node_distances
-    return np.asarray(weights / weights.sum())
+def _interpolate_between_nodes(coordinate: float) -> tuple[int, Array]:
+    """Return the first of the nearest grid nodes, and the interpolation weight of each.
 
-
-def fit_with_sigma_ratios(
-    position_batches: Iterable[PositionsAndIncrements],
-    sigma_a_to_sigma_z_ratios: Sequence[float],
-    random_walk_to_sigma_z_ratio: float,
-    measurement_weights: Array,
-    sigma_z_m: float,
-) -> list[PositionFit]:
-    """Fit constant errors (such as biases) to positions, for each ratio SIGMA_A / SIGMA_Z (1/s²).
-
-    The batches contain successive segments of the flight. The result has one fit for each ratio.
-    ``random_walk_to_sigma_z_ratio`` has the unit 1/√s.
+    Method: barycentric interpolation (Berrut and Trefethen 2004).
     """
-    fits_by_batch = []
-    end = 0
-    for positions in position_batches:
-        begin, end = end, end + len(positions.measurement_m)
-        positions_over_sigma_z, variance_m2 = positions.divide_sigmas_by_sigma_z(
-            sigma_z_m, random_walk_to_sigma_z_ratio, measurement_weights[begin:end]
-        )
-        fits_by_batch.append(
-            [
-                fit_positions(positions_over_sigma_z, ratio, variance_m2)
-                for ratio in sigma_a_to_sigma_z_ratios
-            ]
-        )
-    return [
-        replace(
-            batch_fits[0],
-            gram_matrix=np.concatenate([batch_fit.gram_matrix for batch_fit in batch_fits]),
-            covariance_log_determinant=sum(
-                batch_fit.covariance_log_determinant for batch_fit in batch_fits
-            ),
-            degrees_of_freedom=sum(batch_fit.degrees_of_freedom for batch_fit in batch_fits),
-        )
-        for batch_fits in zip(*fits_by_batch, strict=True)
-    ]
+    first_index = floor(coordinate) - (GRID_NODE_COUNT - 1) // 2
+    node_distances = coordinate - first_index - GRID_NODES
+    if not node_distances.all():
+        return first_index, np.asarray(node_distances == 0.0, dtype=np.float64)
+    weights = BARYCENTRIC_WEIGHTS / node_distances
+    return first_index, np.asarray(weights / weights.sum())
+
+
+def add_noises(
+    positions: PositionsAndIncrements, noise_parameters: NoiseParameters, measurement_weights: Array
+) -> tuple[PositionsAndIncrements, Array]:
+    """Add random walk and time-correlated noise; return also the variance of each measurement.
+
+    ``measurement_weights`` may omit the first rows of the positions, which are initial states
+    without a measurement. Their variance has no effect.
+    """
+    process_noise = positions.process_noise_independent_of_sigma_a.copy()
+    process_noise[0] += positions.interval_s * noise_parameters.random_walk_m**2
+    positions = replace(positions, process_noise_independent_of_sigma_a=process_noise)
+    if noise_parameters.correlated_sigma_m:
+        correlated_noise = noise_parameters.correlated_sigma_m, noise_parameters.tau_s
+        positions = replace(positions, correlated_noise=correlated_noise)
+    variance_m2 = np.ones(len(positions.measurement_m))
+    variance_m2[-len(measurement_weights) :] = noise_parameters.sigma_z_m**2 / measurement_weights
+    return positions, variance_m2
 
 
 def fit_constant_errors(
@@ -248,23 +211,22 @@ def fit_constant_errors(
     The batches contain successive segments of the flight. The variance of a measurement is
     SIGMA_Z² / weight.
     """
-    sigma_z_m = noise_parameters.sigma_z_m
-    if noise_parameters.correlated_sigma_m:
-        position_batches = (
-            replace(
-                positions,
-                correlated_noise=(noise_parameters.correlated_sigma_m, noise_parameters.tau_s),
-            )
-            for positions in position_batches
+    batch_fits = []
+    end = 0
+    for positions in position_batches:
+        begin, end = end, end + len(positions.measurement_m)
+        noisy_positions, variance_m2 = add_noises(
+            positions, noise_parameters, measurement_weights[begin:end]
         )
-    (position_fit,) = fit_with_sigma_ratios(
-        position_batches,
-        [noise_parameters.sigma_a_m_s2 / sigma_z_m],
-        noise_parameters.random_walk_m / sigma_z_m,
-        measurement_weights,
-        sigma_z_m,
+        batch_fits.append(
+            fit_positions(noisy_positions, noise_parameters.sigma_a_m_s2, variance_m2)
+        )
+    return PositionFit(
+        np.concatenate([fit.gram_matrix for fit in batch_fits]),
+        sum(fit.covariance_log_determinant for fit in batch_fits),
+        sum(fit.degrees_of_freedom for fit in batch_fits),
+        batch_fits[0].prior_sigmas_of_constant_errors,
     )
-    return position_fit.scale_sigmas(sigma_z_m)
 
 
 def negative_log_likelihood(
@@ -283,14 +245,51 @@ def negative_log_likelihood(
     )
 
 
+class OutlierDistribution(NamedTuple):
+    """Fraction of outliers, and ratio of their σ to SIGMA_Z.
+
+    In the methods, ``normalised_squares`` contains the squared error of each measurement ÷
+    SIGMA_Z², summed over its ``measured_axis_counts`` axes.
+    """
+
+    fraction: float
+    sigma_ratio: float
+
+    @classmethod
+    def fit(
+        cls, outlier_probability: Array, normalised_squares: Array, measured_axis_counts: Array
+    ) -> OutlierDistribution:
+        """Fit the distribution to measurements with known outlier probabilities (M step)."""
+        mean_square = np.sum(outlier_probability * normalised_squares) / max(
+            np.sum(outlier_probability * measured_axis_counts), 1e-9
+        )
+        min_fraction = 0.5 / len(outlier_probability)
+        return cls(
+            float(np.clip(outlier_probability.mean(), min_fraction, MAX_OUTLIER_FRACTION)),
+            max(MIN_OUTLIER_SIGMA_RATIO, float(np.sqrt(mean_square))),
+        )
+
+    def compute_probability(self, normalised_squares: Array, measured_axis_counts: Array) -> Array:
+        """Return the probability of each measurement to be an outlier (E step)."""
+        log_odds = np.log(self.fraction / (1.0 - self.fraction)) - measured_axis_counts * np.log(
+            self.sigma_ratio
+        )
+        return np.asarray(expit(log_odds + 0.5 * normalised_squares * (1.0 - self.sigma_ratio**-2)))
+
+    def compute_weights(self, outlier_probability: Array) -> Array:
+        """Return the weights: 1 for a good measurement, 1 / ratio² for an outlier."""
+        return 1.0 - outlier_probability * (1.0 - self.sigma_ratio**-2)
+
+
+INITIAL_OUTLIERS = OutlierDistribution(fraction=0.005, sigma_ratio=10.0)
+
+
 @dataclass(frozen=True)
 class NoiseFit:
     """Maximum-likelihood noise parameters, and the outliers among the measurements.
 
     Attributes
     ----------
-    outlier_fraction, outlier_sigma_ratio : float
-        Fraction of outliers, and ratio of their σ to SIGMA_Z.
     outlier_probability : ndarray, shape (m,)
         Probability of each measurement to be an outlier.
     measurement_weights : ndarray, shape (m,)
@@ -307,8 +306,7 @@ class NoiseFit:
     outlier_probability: Array
     score: NegativeLogLikelihood
     variance_factor_of_ln_sigma_z: float
-    outlier_fraction: float
-    outlier_sigma_ratio: float
+    outliers: OutlierDistribution
 
     def compute_score(self) -> float:
         """Return -ln p of the measurements at the maximum-likelihood noise parameters."""
@@ -327,16 +325,19 @@ def convert_to_positions_and_increments(
     prior_precision = np.zeros((measurement_count + 1, 2))
     prior_precision[0] = KNOWN_INITIAL_STATE_PRECISION
     measured_m = np.append(np.nan, preintegrated_motion.measurement_m)[:, None]
+    # One axis and one time offset. Inputs: the data, then unit errors of the initial position and
+    # of the initial velocity
     dp, dv = np.zeros((2, 1, 1, 3, measurement_count))
     dp[0, 0, 0] = preintegrated_motion.delta_position_m
     dv[0, 0, 0] = preintegrated_motion.delta_velocity_m_s
-    # Errors of the initial position and velocity enter in the first interval only
+    # The first interval starts at KF's initial state, which is fixed by its prior. Errors of the
+    # initial position and velocity therefore change the increments of this interval only
     dp[0, 0, 1:, 0] = (1.0, preintegrated_motion.interval_s[0])
     dv[0, 0, 2, 0] = 1.0
     return subtract_smooth_path(
         PositionsAndIncrements(
             measurement_m=measured_m,
-            segment_starts=np.array([0]),
+            segment_start_indices=np.array([0]),
             interval_s=preintegrated_motion.interval_s,
             process_noise_per_sigma_a_squared=preintegrated_motion.process_noise_per_sigma_a_squared.T,
             process_noise_independent_of_sigma_a=preintegrated_motion.process_noise_independent_of_sigma_a.T,
@@ -367,94 +368,89 @@ def maximise_likelihood(
     fits_outliers : bool
         True to estimate the outliers; False to keep the weights.
     """
-    outlier_probability = np.zeros_like(measurement_weights)
-    outlier_fraction, outlier_sigma_ratio = INITIAL_OUTLIER_FRACTION, INITIAL_OUTLIER_SIGMA_RATIO
-    is_long = len(measurement_weights) > 2 * INITIAL_FIT_MEASUREMENT_COUNT
-    if is_long:
-        positions_of_first_fit = [
-            positions.first(
-                len(positions.measurement_m)
-                - len(measurement_weights)
-                + INITIAL_FIT_MEASUREMENT_COUNT
-            )
-            for positions in positions_by_axis
-        ]
-        first_fit = maximise_likelihood(
-            positions_of_first_fit,
-            start_parameters,
-            measurement_weights[:INITIAL_FIT_MEASUREMENT_COUNT],
-            fits_outliers,
+    if len(measurement_weights) <= 2 * INITIAL_FIT_MEASUREMENT_COUNT:
+        return _fit_noises_and_outliers(
+            positions_by_axis, start_parameters, measurement_weights, fits_outliers
         )
-        start_parameters = first_fit.noise_parameters
-        outlier_fraction = first_fit.outlier_fraction
-        outlier_sigma_ratio = first_fit.outlier_sigma_ratio
+    # In a long flight, a fit to the first measurements gives the initial values
+    omitted_count = len(measurement_weights) - INITIAL_FIT_MEASUREMENT_COUNT
+    first_fit = _fit_noises_and_outliers(
+        [
+            positions.first(len(positions.measurement_m) - omitted_count)
+            for positions in positions_by_axis
+        ],
+        start_parameters,
+        measurement_weights[:INITIAL_FIT_MEASUREMENT_COUNT],
+        fits_outliers,
+    )
+    return _fit_noises_and_outliers(
+        positions_by_axis,
+        first_fit.noise_parameters,
+        measurement_weights,
+        fits_outliers,
+        first_fit.outliers,
+        MAX_OUTLIER_ITERATIONS,
+    )
+
+
+def _fit_noises_and_outliers(
+    positions_by_axis: Sequence[PositionsAndIncrements],
+    start_parameters: NoiseParameters,
+    measurement_weights: Array,
+    fits_outliers: bool,
+    outliers: OutlierDistribution = INITIAL_OUTLIERS,
+    outlier_iterations_per_fit: int = 1,
+) -> NoiseFit:
+    """Alternately fit the outliers (expectation maximisation) and the noises."""
+    outlier_probability = np.zeros_like(measurement_weights)
     likelihood = NegativeLogLikelihood(
         positions_by_axis, measurement_weights, start_parameters.sigma_z_m
     )
     noise_parameters = _maximise_by_gradient(likelihood, start_parameters)
     for _ in range(MAX_OUTLIER_ITERATIONS if fits_outliers else 0):
-        expected_squared_errors_m2, measured_axis_counts = _estimate_squared_errors(
+        normalised_squares, measured_axis_counts = _estimate_normalised_squares(
             positions_by_axis, noise_parameters, measurement_weights
         )
         # Outliers increase the estimated SIGMA_Z, but hardly the median of the squared errors
-        robust_variance_m2 = float(
-            np.median(expected_squared_errors_m2 / measured_axis_counts)
-            / (chdtri(measured_axis_counts[0], 0.5) / measured_axis_counts[0])
-        )
+        axis_count = measured_axis_counts[0]
+        median_square = float(np.median(normalised_squares / measured_axis_counts))
+        sigma_z_m = noise_parameters.sigma_z_m
+        robust_sigma_z_m = sigma_z_m * (median_square * axis_count / chdtri(axis_count, 0.5)) ** 0.5
         # If most errors exceed the search range of SIGMA_Z, no measurement is treated as an outlier
-        if robust_variance_m2 > SIGMA_Z_SEARCH_RANGE_M[1] ** 2:
+        if robust_sigma_z_m > SIGMA_Z_SEARCH_RANGE_M[1]:
             break
-        limited_measurement_variance_m2 = min(
-            noise_parameters.sigma_z_m**2,
-            MAX_SIGMA_Z_TO_MEDIAN_BASED_SIGMA_Z_RATIO**2 * robust_variance_m2,
+        limited_sigma_z_m = min(
+            sigma_z_m, MAX_SIGMA_Z_TO_MEDIAN_BASED_SIGMA_Z_RATIO * robust_sigma_z_m
         )
-        normalised_squares = expected_squared_errors_m2 / limited_measurement_variance_m2
+        normalised_squares *= (sigma_z_m / limited_sigma_z_m) ** 2
         previous_probability = outlier_probability
-        for _ in range(MAX_OUTLIER_ITERATIONS if is_long else 1):
-            outlier_probability = _compute_outlier_probability(
-                normalised_squares, measured_axis_counts, outlier_fraction, outlier_sigma_ratio
+        for _ in range(outlier_iterations_per_fit):
+            outlier_probability = outliers.compute_probability(
+                normalised_squares, measured_axis_counts
             )
-            outlier_fraction = float(
-                np.clip(
-                    outlier_probability.mean(), 0.5 / len(measurement_weights), MAX_OUTLIER_FRACTION
-                )
+            outliers = OutlierDistribution.fit(
+                outlier_probability, normalised_squares, measured_axis_counts
             )
-            outlier_mean_normalised_square = np.sum(outlier_probability * normalised_squares) / max(
-                np.sum(outlier_probability * measured_axis_counts), 1e-9
-            )
-            outlier_sigma_ratio = max(
-                MIN_OUTLIER_SIGMA_RATIO, float(np.sqrt(outlier_mean_normalised_square))
-            )
-        if (
-            outlier_probability.sum() < 1.0
-            and outlier_probability.max() < 0.5
-            and not previous_probability.any()
-        ):
+        has_outliers = outlier_probability.sum() >= 1.0 or outlier_probability.max() >= 0.5
+        if not has_outliers and not previous_probability.any():
             outlier_probability = previous_probability
             break
-        measurement_weights = 1.0 - outlier_probability * (1.0 - outlier_sigma_ratio**-2.0)
+        measurement_weights = outliers.compute_weights(outlier_probability)
         likelihood = NegativeLogLikelihood(
             positions_by_axis, measurement_weights, start_parameters.sigma_z_m
         )
         noise_parameters = _maximise_by_gradient(
-            likelihood,
-            replace(noise_parameters, sigma_z_m=float(np.sqrt(limited_measurement_variance_m2))),
+            likelihood, replace(noise_parameters, sigma_z_m=limited_sigma_z_m)
         )
-        if (
-            np.abs(outlier_probability - previous_probability).max()
-            < MAX_OUTLIER_PROBABILITY_CHANGE
-        ):
+        probability_changes = np.abs(outlier_probability - previous_probability)
+        if probability_changes.max() < MAX_OUTLIER_PROBABILITY_CHANGE:
             break
     variance_factor_of_ln_sigma_z = 1.0
     if outlier_probability.any():
-        expected_squared_errors_m2, measured_axis_counts = _estimate_squared_errors(
-            positions_by_axis, noise_parameters, measurement_weights
-        )
         variance_factor_of_ln_sigma_z = compute_variance_factor_of_ln_sigma_z(
-            expected_squared_errors_m2 / noise_parameters.sigma_z_m**2,
-            measured_axis_counts,
+            *_estimate_normalised_squares(positions_by_axis, noise_parameters, measurement_weights),
             outlier_probability,
-            outlier_sigma_ratio,
+            outliers.sigma_ratio,
         )
     return NoiseFit(
         noise_parameters,
@@ -462,8 +458,7 @@ def maximise_likelihood(
         outlier_probability,
         likelihood,
         variance_factor_of_ln_sigma_z,
-        outlier_fraction,
-        outlier_sigma_ratio,
+        outliers,
     )
 
 
@@ -473,25 +468,21 @@ def estimate_outlier_probability(
     """Return the probability of each measurement to be an outlier, with the noises of ``fit``."""
     outlier_probability = np.zeros(measurement_count)
     for _ in range(OUTLIER_ITERATIONS_WITH_GIVEN_NOISES):
-        measurement_weights = 1.0 - outlier_probability * (1.0 - fit.outlier_sigma_ratio**-2.0)
-        expected_squared_errors_m2, measured_axis_counts = _estimate_squared_errors(
-            positions_by_axis, fit.noise_parameters, measurement_weights
-        )
-        outlier_probability = _compute_outlier_probability(
-            expected_squared_errors_m2 / fit.noise_parameters.sigma_z_m**2,
-            measured_axis_counts,
-            fit.outlier_fraction,
-            fit.outlier_sigma_ratio,
+        measurement_weights = fit.outliers.compute_weights(outlier_probability)
+        outlier_probability = fit.outliers.compute_probability(
+            *_estimate_normalised_squares(
+                positions_by_axis, fit.noise_parameters, measurement_weights
+            )
         )
     return outlier_probability
 
 
-def _estimate_squared_errors(
+def _estimate_normalised_squares(
     positions_by_axis: Sequence[PositionsAndIncrements],
     noise_parameters: NoiseParameters,
     measurement_weights: Array,
 ) -> tuple[Array, Array]:
-    """Return the expected squared error (m²) of each measurement, summed over its measured axes.
+    """Return the expected squared error ÷ SIGMA_Z² of each measurement, summed over its axes.
 
     Return also the number of measured axes of each measurement.
     """
@@ -500,35 +491,17 @@ def _estimate_squared_errors(
         constant_errors = fit_constant_errors(
             [positions], noise_parameters, measurement_weights
         ).estimate_constant_errors_by_segment()[:, 0]
-        positions_with_random_walk, measurement_variance_m2 = positions.divide_sigmas_by_sigma_z(
-            1.0, noise_parameters.random_walk_m, measurement_weights / noise_parameters.sigma_z_m**2
-        )
+        noisy_positions, variance_m2 = add_noises(positions, noise_parameters, measurement_weights)
         squared_errors_and_axis_counts.append(
             estimate_squared_errors(
-                positions_with_random_walk,
-                noise_parameters.sigma_a_m_s2,
-                measurement_variance_m2,
-                constant_errors,
+                noisy_positions, noise_parameters.sigma_a_m_s2, variance_m2, constant_errors
             )
         )
-    expected_squared_errors_m2, measured_axis_counts = np.sum(
-        squared_errors_and_axis_counts, axis=0
-    )[:, -len(measurement_weights) :]
-    return expected_squared_errors_m2, measured_axis_counts
-
-
-def _compute_outlier_probability(
-    normalised_squares: Array,
-    measured_axis_counts: Array,
-    outlier_fraction: float,
-    outlier_sigma_ratio: float,
-) -> Array:
-    log_odds = np.log(outlier_fraction / (1.0 - outlier_fraction)) - measured_axis_counts * np.log(
-        outlier_sigma_ratio
-    )
-    return np.asarray(
-        expit(log_odds + 0.5 * normalised_squares * (1.0 - outlier_sigma_ratio**-2.0))
-    )
+    # Without KF's initial state, which has no measurement
+    squared_errors_m2, measured_axis_counts = np.sum(squared_errors_and_axis_counts, axis=0)[
+        :, -len(measurement_weights) :
+    ]
+    return squared_errors_m2 / noise_parameters.sigma_z_m**2, measured_axis_counts
 
 
 def compute_variance_factor_of_ln_sigma_z(
@@ -544,16 +517,19 @@ def compute_variance_factor_of_ln_sigma_z(
     error of each measurement ÷ SIGMA_Z², summed over its ``measured_axis_counts`` axes.
     """
     outlier_fraction = np.mean(outlier_probability)
-    log_sigma_z_information = 2.0 * float(np.sum(measured_axis_counts))
+    sigma_z_information = 2.0 * float(np.sum(measured_axis_counts))
+    outlier_information = 2.0 * float(np.sum(measured_axis_counts * outlier_probability))
+    fraction_information = len(normalised_squares) * outlier_fraction * (1.0 - outlier_fraction)
     inverse_outlier_variance_ratio = outlier_sigma_ratio**-2.0
-    information_with_known_outliers = np.zeros((3, 3))
-    information_with_known_outliers[:2, :2] = 2.0 * np.sum(
-        measured_axis_counts * outlier_probability
+    # Parameters: ln SIGMA_Z, ln of the outliers' σ ÷ SIGMA_Z, and log odds of the outlier fraction
+    information_with_known_outliers = np.array(
+        [
+            [sigma_z_information, outlier_information, 0.0],
+            [outlier_information, outlier_information, 0.0],
+            [0.0, 0.0, fraction_information],
+        ]
     )
-    information_with_known_outliers[0, 0] = log_sigma_z_information
-    information_with_known_outliers[2, 2] = (
-        len(normalised_squares) * outlier_fraction * (1.0 - outlier_fraction)
-    )
+    # Score of an outlier minus score of a good measurement, for each parameter
     scores = np.stack(
         [
             normalised_squares * (inverse_outlier_variance_ratio - 1.0),
@@ -566,7 +542,7 @@ def compute_variance_factor_of_ln_sigma_z(
     # With very few outliers, the information matrix may not be positive definite
     if np.linalg.eigvalsh(observed_information)[0] <= 0.0:
         return 1.0
-    return max(1.0, log_sigma_z_information * float(np.linalg.inv(observed_information)[0, 0]))
+    return max(1.0, sigma_z_information * float(np.linalg.inv(observed_information)[0, 0]))
 
 
 def _maximise_by_gradient(

@@ -13,12 +13,13 @@ from msgspec import structs
 from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array, compute_median_interval_s
-from px4fuse.core.record import NotNegative, Record, Share
+from px4fuse.core.record import NonNegativeFloat, Record, Share
 from px4fuse.filter.fitting import NoiseParameters, fit_constant_errors, maximise_likelihood
 from px4fuse.filter.imu_motion import (
     MAX_IMU_INTERVAL_S,
     MIN_SEGMENT_MEASUREMENTS,
     MotionCache,
+    PositionsAndImuMotion,
     compute_imu_motion,
 )
 from px4fuse.filter.settings import Settings
@@ -55,16 +56,16 @@ HEADING_SIGMA_RAD = 1.0
 MIN_TRUE_TO_MEASURED_SCALE = 0.1
 # Index of the heading error in the constant errors. Its index in the IMU increments is larger by 1,
 # because index 0 is the motion itself
-HEADING_ERROR_INDEX = 2
+HEADING_INDEX_IN_CONSTANT_ERRORS = 2
 
 
-class HeadingPart(Record):
+class HeadingErrorInPart(Record):
     """Heading error (°) in one part of the flight: yaw of the source frame relative to EKF2."""
 
     start_s: float
     end_s: float
     heading_error_deg: float
-    sigma_deg: NotNegative
+    sigma_deg: NonNegativeFloat
 
 
 class HeadingError(Record):
@@ -85,13 +86,13 @@ class HeadingError(Record):
     """
 
     misalignment_deg: float
-    sigma_deg: NotNegative
+    sigma_deg: NonNegativeFloat
     drifts: bool
-    parts: tuple[HeadingPart, ...]
+    parts: tuple[HeadingErrorInPart, ...]
     drift_p: Share
     by: Literal["orientation", "positions"]
 
-    def find_extreme_parts(self) -> tuple[HeadingPart, HeadingPart]:
+    def find_extreme_parts(self) -> tuple[HeadingErrorInPart, HeadingErrorInPart]:
         """Return flight parts with the smallest and the largest misalignment, in time order."""
         heading_errors_deg = [heading_part.heading_error_deg for heading_part in self.parts]
         first_index, last_index = sorted(
@@ -101,7 +102,7 @@ class HeadingError(Record):
 
 
 def combine_heading_parts(
-    parts: tuple[HeadingPart, ...],
+    parts: tuple[HeadingErrorInPart, ...],
     drift_p_value: float,
     method: Literal["orientation", "positions"],
 ) -> HeadingError:
@@ -183,7 +184,7 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
 
 def _average_flight_parts(
     time_s: Array, misalignment_rad: Array, sigma_rad: float
-) -> tuple[HeadingPart, ...]:
+) -> tuple[HeadingErrorInPart, ...]:
     """Average yaw misalignment (rad) over flight parts of equal duration.
 
     σ is not reduced by averaging, because errors in one part are correlated.
@@ -201,7 +202,7 @@ def _average_flight_parts(
     part_edges_s = np.linspace(time_s[0], time_s[-1], part_count + 1)[1:-1]
     rows_by_part = np.split(np.arange(len(time_s)), np.searchsorted(time_s, part_edges_s))
     return tuple(
-        HeadingPart(
+        HeadingErrorInPart(
             start_s=float(time_s[part_rows[0]]),
             end_s=float(time_s[part_rows[-1]]),
             heading_error_deg=float(np.degrees(misalignment_rad[part_rows].mean())),
@@ -298,38 +299,12 @@ def _estimate_heading_error_from_positions(
                 f"{MIN_HEADING_FIT_DURATION_S:g} s",
                 "Analyse a longer segment.",
             )
-        positions_and_increments = motion.make_positions_at_offset(0.0)
-        # Effect of a heading error: motion along the smooth path through the positions (last row),
-        # rotated by 90°. With the noisy motion from the IMU, the estimate would be too small
-        for increments in (
-            positions_and_increments.delta_position_m,
-            positions_and_increments.delta_velocity_m_s,
-        ):
-            north_m, east_m = increments[:, :, -1]
-            increments[:, :, 1 + HEADING_ERROR_INDEX] = -east_m, north_m
-        noise_parameters = maximise_likelihood(
-            [positions_and_increments],
-            noise_parameters,
-            motion.measurement_weights,
-            fits_outliers=False,
-        ).noise_parameters
-        position_fit = fit_constant_errors(
-            [positions_and_increments], noise_parameters, motion.measurement_weights
+        noise_parameters, error_rad, heading_variance_rad2 = _fit_heading_errors(
+            motion, noise_parameters
         )
-        constant_errors = position_fit.estimate_constant_errors_by_segment()[is_part_long_enough, 0]
-        constant_errors_covariance = np.linalg.inv(
-            position_fit.compute_constant_error_information()
-        )[is_part_long_enough, 0]
-        # The smooth path has the scale of the measured positions, but a heading error rotates true
-        # distances: divide the fitted heading error by the ratio of true to measured distances
-        true_to_measured_scale = np.maximum(
-            1.0 - constant_errors[:, -1], MIN_TRUE_TO_MEASURED_SCALE
-        )
-        error_rad = constant_errors[:, HEADING_ERROR_INDEX] / true_to_measured_scale
-        heading_variance_rad2 = (
-            constant_errors_covariance[:, HEADING_ERROR_INDEX, HEADING_ERROR_INDEX]
-            / true_to_measured_scale**2
-        )
+        error_rad = error_rad[is_part_long_enough]
+        heading_variance_rad2 = heading_variance_rad2[is_part_long_enough]
+        # The fit is linear in the heading error, so it is repeated with rotated positions
         correction_rad, weight_sum = np.average(
             error_rad, weights=1.0 / heading_variance_rad2, returned=True
         )
@@ -345,6 +320,7 @@ def _estimate_heading_error_from_positions(
         heading_drift_variance_rad2 + heading_variance_rad2
     )
     misalignment_rad = float(np.angle(np.exp(1j * misalignment_rad)))
+    # Rows: start, end, heading error, σ
     heading_part_fields = np.column_stack(
         [
             spans_s[is_part_long_enough],
@@ -355,7 +331,42 @@ def _estimate_heading_error_from_positions(
     chi_square = float(np.sum(deviation_rad**2 / heading_variance_rad2))
     is_drift_tested = len(heading_variance_rad2) > 1 and not has_constant_heading
     return combine_heading_parts(
-        tuple(HeadingPart(*row) for row in heading_part_fields.tolist()),
+        tuple(HeadingErrorInPart(*row) for row in heading_part_fields.tolist()),
         float(chdtrc(len(heading_variance_rad2) - 1, chi_square)) if is_drift_tested else 1.0,
         "positions",
+    )
+
+
+def _fit_heading_errors(
+    motion: PositionsAndImuMotion, noise_parameters: NoiseParameters
+) -> tuple[NoiseParameters, Array, Array]:
+    """Fit the noises; return them, and heading error (rad) and variance (rad²) of each segment."""
+    positions_and_increments = motion.make_positions_at_offset(0.0)
+    # Effect of a heading error: motion along the smooth path through the positions (last row),
+    # rotated by 90°. With the noisy motion from the IMU, the estimate would be too small
+    for increments in (
+        positions_and_increments.delta_position_m,
+        positions_and_increments.delta_velocity_m_s,
+    ):
+        north_m, east_m = increments[:, :, -1]
+        increments[:, :, 1 + HEADING_INDEX_IN_CONSTANT_ERRORS] = -east_m, north_m
+    noise_parameters = maximise_likelihood(
+        [positions_and_increments],
+        noise_parameters,
+        motion.measurement_weights,
+        fits_outliers=False,
+    ).noise_parameters
+    position_fit = fit_constant_errors(
+        [positions_and_increments], noise_parameters, motion.measurement_weights
+    )
+    constant_errors = position_fit.estimate_constant_errors_by_segment()[:, 0]
+    covariance = np.linalg.inv(position_fit.compute_constant_error_information())[:, 0]
+    # The smooth path has the scale of the measured positions, but a heading error rotates true
+    # distances: divide the fitted heading error by the ratio of true to measured distances
+    true_to_measured_scale = np.maximum(1.0 - constant_errors[:, -1], MIN_TRUE_TO_MEASURED_SCALE)
+    return (
+        noise_parameters,
+        constant_errors[:, HEADING_INDEX_IN_CONSTANT_ERRORS] / true_to_measured_scale,
+        covariance[:, HEADING_INDEX_IN_CONSTANT_ERRORS, HEADING_INDEX_IN_CONSTANT_ERRORS]
+        / true_to_measured_scale**2,
     )

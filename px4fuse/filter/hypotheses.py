@@ -64,12 +64,12 @@ OUTLIER_RETEST_DURATION_AFTER_JUMP_S = 6.0
 # Maximum false alarm probability of a jump, per flight
 MAX_JUMP_FALSE_ALARM_P = 1e-3
 # Probability that a good measurement near a jump is classified as an outlier
-MAX_FALSE_OUTLIER_P = 1e-3
+MAX_FALSE_OUTLIER_PROBABILITY = 1e-3
 # Maximum number of measurement times at which a detected jump is tested, to locate the jump
 MAX_CANDIDATE_JUMP_TIMES = 6
 MAX_JUMPS = 3
 # Minimum accelerometer bias (m/s²) that is reported: half of EKF2_ABL_LIM
-MIN_BIAS_M_S2 = 0.2
+MIN_REPORTED_ACCELEROMETER_BIAS_M_S2 = 0.2
 # Minimum ratio of a reported accelerometer bias to its σ
 MIN_BIAS_TO_SIGMA_RATIO = 4.0
 MIN_MEASUREMENTS_BEFORE_AND_AFTER_JUMP = 8
@@ -129,7 +129,9 @@ class SystematicErrors:
 
     def has_significant_bias(self) -> bool:
         bias = self.compute_horizontal_bias()
-        return bias.value >= max(MIN_BIAS_M_S2, MIN_BIAS_TO_SIGMA_RATIO * bias.sigma)
+        return bias.value >= max(
+            MIN_REPORTED_ACCELEROMETER_BIAS_M_S2, MIN_BIAS_TO_SIGMA_RATIO * bias.sigma
+        )
 
 
 def estimate_mean_acceleration_error(axis: Axis) -> float | None:
@@ -248,13 +250,13 @@ def _fit_scale(design_matrix: DesignMatrix, is_skipped: BoolArray) -> Estimate:
     if curvature <= 0.0:
         return Estimate(0.0, math.inf)
     grid_step = tested_scales[1] - tested_scales[0]
+    # At the ends of the tested range, do not extrapolate by more than half a grid step
     best_scale = tested_scales[centre_index] + float(np.clip(vertex_shift, -1.5, 1.5)) * grid_step
     centre_fit = fit_scale(centre_index)
-    lengthening_factor_of_linearised_rotation = math.hypot(
-        1.0, centre_fit.coefficients[FRAME_ROTATION_COLUMN]
-    )
+    # The linearised rotation by θ (x - θ y, y + θ x) lengthens the acceleration by √(1 + θ²)
+    lengthening_factor = math.hypot(1.0, centre_fit.coefficients[FRAME_ROTATION_COLUMN])
     return Estimate(
-        float(best_scale * lengthening_factor_of_linearised_rotation - 1.0),
+        float(best_scale * lengthening_factor - 1.0),
         grid_step / math.sqrt(curvature) * max(centre_fit.residual_rms, 1.0),
     )
 
@@ -280,7 +282,8 @@ def _find_jumps(
     ]
 
     def mask_outliers_near_jump(jump_time_s: float) -> BoolArray:
-        # Positions after a reset that the source reports are valid, even if they are in the mask
+        # Omit the positions just after a jump, because they may be a burst of outliers. But
+        # positions after a reset that the source reports are valid, even if they are in the mask
         if jump_time_s in source_reset_times_s:
             return is_skipped & ~_is_in_window(
                 time_s, jump_time_s, OUTLIER_RETEST_DURATION_AFTER_JUMP_S
@@ -291,6 +294,8 @@ def _find_jumps(
         outlier_run_starts_s = time_s[
             np.flatnonzero(is_skipped & ~np.append(False, is_skipped[:-1]))
         ]
+        # After a jump, all positions may seem to be outliers, so it may be at the start of a run of
+        # outliers. Of all other times, test only the best
         candidate_times_s = [
             *source_reset_times_s,
             *_find_significant_jump_times(design_matrix, fit, is_skipped, outlier_run_starts_s),
@@ -364,17 +369,19 @@ def _compute_jump_chi_squares(
         jump_response = design_matrix.compute_normalised_innovations(
             zero_increments, zero_increments, unit_steps, fit_without_jump.gains[:, rows]
         )[is_used]
-        for columns, residual, residual_rms in zip(
+        for axis_columns, residual, residual_rms in zip(
             columns_by_axis,
             fit_without_jump.residual,
             fit_without_jump.residual_rms_by_axis,
             strict=True,
         ):
-            response_along_columns = columns[rows][is_used].T @ jump_response
+            # Information on the jump that the other columns cannot explain (Schur complement)
+            response_along_columns = axis_columns[rows][is_used].T @ jump_response
             jump_size_information = np.sum(jump_response**2, axis=0) - np.sum(
                 response_along_columns * (fit_without_jump.covariance @ response_along_columns),
                 axis=0,
             )
+            # Estimated jump, squared, over its variance
             chi_squares[batch] += (
                 residual[rows][is_used] @ jump_response / residual_rms
             ) ** 2 / np.maximum(jump_size_information, 1e-9)
@@ -390,19 +397,24 @@ def _locate_jump(
     is_after_jump = ~is_near_jump & _is_in_window(
         time_s, jump.time_s, OUTLIER_RETEST_DURATION_AFTER_JUMP_S
     )
-    max_residual_square = chdtri(design_matrix.axis_count, MAX_FALSE_OUTLIER_P)
+    max_residual_square = chdtri(design_matrix.axis_count, MAX_FALSE_OUTLIER_PROBABILITY)
 
     def test_for_outliers(jump_time_s: float) -> BoolArray:
         # Measurements near the jump may be outliers, so the fit omits them
         fit, _ = design_matrix.fit_with_jump(jump_time_s, is_skipped | is_near_jump)
         return fit.compute_residual_squares() > max_residual_square
 
+    # First test the measurements after the jump: without the jump, correct ones seemed to be
+    # outliers. Then test each time near the jump, with the measurements near it
     is_skipped = np.where(is_after_jump, test_for_outliers(jump.time_s), is_skipped)
     candidate_times_s = time_s[is_near_jump]
-    is_used_outlier = is_skipped & ~is_near_jump
+    is_skipped_away_from_jump = is_skipped & ~is_near_jump
     best_indices = np.argsort(
         -_compute_jump_chi_squares(
-            design_matrix, design_matrix.fit(is_used_outlier), is_used_outlier, candidate_times_s
+            design_matrix,
+            design_matrix.fit(is_skipped_away_from_jump),
+            is_skipped_away_from_jump,
+            candidate_times_s,
         )
     )[:MAX_CANDIDATE_JUMP_TIMES]
     outlier_mask_by_jump_time = {
@@ -562,6 +574,7 @@ class DesignMatrix:
         sum_of_log_variances = self.axis_count * float(np.sum(np.log(gains[0, ~is_skipped])))
         is_used = np.tile(~is_skipped, self.axis_count)
         used_innovations, used_columns = normalised_innovations[is_used], columns[is_used]
+        # Ridge regression: the slow error has a prior, constant errors and jumps have none
         prior_precision = np.zeros(columns.shape[1])
         prior_precision[: len(self.prior_sigma)] = self.prior_sigma**-2.0
         information = np.diag(prior_precision) + used_columns.T @ used_columns
@@ -572,6 +585,7 @@ class DesignMatrix:
         information_factor = cho_factor(information)
         covariance = cho_solve(information_factor, np.eye(len(information)))
         coefficients = covariance @ right_hand_side
+        # Sum of squared residuals, and of squared coefficients over prior variances
         square_sum = float(used_innovations @ used_innovations - coefficients @ right_hand_side)
         log_determinant = 2.0 * float(np.sum(np.log(np.diag(information_factor[0]))))
         degrees_of_freedom = max(len(used_innovations) - CONSTANT_ERROR_COLUMN_COUNT, 1)
@@ -581,11 +595,11 @@ class DesignMatrix:
             residual,
             coefficients,
             covariance,
-            square_sum,
-            0.5 * (square_sum + sum_of_log_variances + log_determinant),
-            math.sqrt(max(square_sum, 0.0) / degrees_of_freedom),
-            np.sqrt(np.maximum(mean_squares, 1.0)),
-            gains,
+            residual_and_prior_square_sum=square_sum,
+            score=0.5 * (square_sum + sum_of_log_variances + log_determinant),
+            residual_rms=math.sqrt(max(square_sum, 0.0) / degrees_of_freedom),
+            residual_rms_by_axis=np.sqrt(np.maximum(mean_squares, 1.0)),
+            gains=gains,
         )
 
     def compute_innovations_and_design_matrix(self, gains: Array, scale: float = 1.0) -> ArrayPair:
@@ -596,7 +610,8 @@ class DesignMatrix:
         """
         inputs, axis_count = self.preintegrated_inputs, self.axis_count
         input_count = inputs.measurement_m.shape[1]
-        # Only inputs with measured acceleration are multiplied by the scale factor
+        # Only inputs with measured acceleration are multiplied by the scale factor: for each axis,
+        # the flight data (first input of the axis) and the rotation
         input_scale_factors = np.ones(input_count)
         acceleration_input_indices = INPUTS_PER_AXIS * np.arange(axis_count)
         input_scale_factors[acceleration_input_indices] = scale
@@ -609,6 +624,7 @@ class DesignMatrix:
             np.hstack([inputs.measurement_m, unit_steps]),
             gains,
         )
+        # Inputs: those of each axis, then the slow errors, then the jumps
         *responses_by_axis, slow_error_responses, jump_responses = np.split(
             responses, [*(acceleration_input_indices + INPUTS_PER_AXIS), input_count], axis=1
         )
@@ -666,7 +682,7 @@ def make_design_matrix(
             integrate_between_measurements(velocity_error_m_s @ axis.direction, error_time_s)
             for error_time_s, velocity_error_m_s in velocity_errors_per_unit_bias_and_yaw
         ]
-    # The slow acceleration error is linear between knots
+    # The slow acceleration error is linear between knots; the grid has 20 samples per interval
     slow_error_knot_interval_count = int(
         np.clip(
             np.ceil((time_s[-1] - time_s[0]) / SLOW_ERROR_KNOT_SPACING_S), 1, MAX_SLOW_ERROR_KNOTS
@@ -682,6 +698,7 @@ def make_design_matrix(
             )
         )
     dp, dv = np.transpose(increments, (1, 2, 0))
+    # Only the flight data, the first input of each axis, contain positions
     measured_m = np.zeros_like(dp)
     measured_m[:, : INPUTS_PER_AXIS * len(axes) : INPUTS_PER_AXIS] = np.transpose(
         [motion.measurement_m for motion in preintegrated_motions]

@@ -29,9 +29,14 @@ from px4fuse.core.arrays import (
     interpolate_columns,
 )
 from px4fuse.core.record import Span
-from px4fuse.filter.fitting import NoiseParameters, fit_with_sigma_ratios
+from px4fuse.filter.fitting import (
+    NoiseFit,
+    NoiseParameters,
+    fit_constant_errors,
+    maximise_likelihood,
+)
 from px4fuse.filter.marginal_likelihood import (
-    MAX_BATCH_ELEMENTS,
+    PositionFit,
     PositionsAndIncrements,
     subtract_smooth_path,
 )
@@ -45,7 +50,8 @@ from px4fuse.trajectory.rotation import (
     interpolate,
     multiply,
     rotate,
-    to_matrix,
+    skew,
+    to_rotation_matrix,
     to_rotation_vector,
 )
 
@@ -74,6 +80,8 @@ INTEGRATION_STEP_S = 0.02
 # Prior precision of the initial position (1/m²) and velocity (s²/m²) of a segment: small, but not
 # zero, so that the matrix of the normal equations is not singular
 INITIAL_STATE_PRIOR_PRECISIONS = 1e-6, 1e-4
+# Maximum number of array elements at once, to limit the memory
+MAX_BATCH_ELEMENTS = 2**16
 # Maximum median interval (s) between IMU samples
 MAX_IMU_INTERVAL_S = 0.025
 
@@ -149,8 +157,8 @@ class PositionsAndImuMotion:
             np.arange(len(self.time_s)) % max(1, round(len(self.time_s) / max_measurement_count))
             == 0
         )
-        kept_counts = np.add.reduceat(is_kept.astype(int), self.segment_edges[:-1])
-        has_enough_measurements = kept_counts >= MIN_KEPT_MEASUREMENTS
+        kept_measurement_counts = np.add.reduceat(is_kept.astype(int), self.segment_edges[:-1])
+        has_enough_measurements = kept_measurement_counts >= MIN_KEPT_MEASUREMENTS
         if not has_enough_measurements.any():
             return self
         is_kept &= np.repeat(has_enough_measurements, np.diff(self.segment_edges))
@@ -159,7 +167,7 @@ class PositionsAndImuMotion:
             time_s=self.time_s[is_kept],
             measurement_m=self.measurement_m[is_kept],
             measurement_weights=self.measurement_weights[is_kept],
-            segment_edges=np.cumsum([0, *kept_counts[has_enough_measurements]]),
+            segment_edges=np.cumsum([0, *kept_measurement_counts[has_enough_measurements]]),
             segment_motions=tuple(
                 self.segment_motions[index] for index in np.flatnonzero(has_enough_measurements)
             ),
@@ -177,6 +185,7 @@ class PositionsAndImuMotion:
         )
         prior_precision = np.zeros((len(self.time_s), 2))
         prior_precision[self.segment_edges[:-1]] = INITIAL_STATE_PRIOR_PRECISIONS
+        # The data, nine constant errors of attitude and IMU, and the scale factor error
         column_count = 1 + len(PRIOR_SIGMAS_OF_CONSTANT_ERRORS)
         dp, dv = np.zeros(
             (2, len(self.directions), len(time_offsets_s), column_count, len(interval_s))
@@ -193,12 +202,13 @@ class PositionsAndImuMotion:
                     measurement_time_s + time_offsets_s[:, None]
                 )
             )
+            # All columns except that of the scale factor error
             interval_rows = np.s_[:, :, :-1, begin : end - 1]
             dv[interval_rows] = np.diff(velocity)
             dp[interval_rows] = np.diff(position) - velocity[..., :-1] * np.diff(measurement_time_s)
         return PositionsAndIncrements(
             measurement_m=self.measurement_m,
-            segment_starts=self.segment_edges[:-1],
+            segment_start_indices=self.segment_edges[:-1],
             interval_s=interval_s,
             process_noise_per_sigma_a_squared=process_noise_per_sigma_a_squared,
             process_noise_independent_of_sigma_a=np.zeros_like(process_noise_per_sigma_a_squared),
@@ -225,7 +235,8 @@ class PositionsAndImuMotion:
     ) -> Iterator[PositionsAndIncrements]:
         """Yield positions and IMU increments for all time offsets, a few segments at once.
 
-        With ``estimates_scale``, the scale factor of the positions can be estimated.
+        With ``estimates_scale``, the scale factor of the positions can be estimated: a smooth path
+        through the positions is subtracted, and becomes the derivative for the scale factor error.
         """
         element_count = (
             len(time_offsets_s) * self.measurement_m.size * len(PRIOR_SIGMAS_OF_CONSTANT_ERRORS)
@@ -233,6 +244,7 @@ class PositionsAndImuMotion:
         segment_count = len(self.segment_motions)
         batch_count = min(-(-element_count // MAX_BATCH_ELEMENTS), segment_count)
         for batch in np.array_split(np.arange(segment_count), batch_count):
+            # Starts of the segments of the batch, and end of the last segment
             edges = self.segment_edges[batch[0] : batch[-1] + 2]
             rows = slice(edges[0], edges[-1])
             batch_motion = replace(
@@ -249,7 +261,26 @@ class PositionsAndImuMotion:
                 else positions
             )
 
-    def search_offset(
+    def fit_at_offsets(
+        self, time_offsets_s: Array, noise_parameters: NoiseParameters
+    ) -> PositionFit:
+        """Fit the constant errors to the positions, for each time offset."""
+        return fit_constant_errors(
+            self.make_position_batches(time_offsets_s), noise_parameters, self.measurement_weights
+        )
+
+    def fit_noises(
+        self, offset_s: float, start_parameters: NoiseParameters, *, fits_outliers: bool = False
+    ) -> NoiseFit:
+        """Estimate the noises (and the outliers) with one time offset."""
+        return maximise_likelihood(
+            [self.make_positions_at_offset(offset_s)],
+            start_parameters,
+            self.measurement_weights,
+            fits_outliers,
+        )
+
+    def search_time_offset(
         self,
         noise_parameters: NoiseParameters,
         sigma_a_factors: Sequence[float] = (1.0,),
@@ -265,36 +296,27 @@ class PositionsAndImuMotion:
         tested_offsets_s = np.linspace(
             -MAX_TESTED_TIME_OFFSET_S, MAX_TESTED_TIME_OFFSET_S, COARSE_OFFSET_COUNT
         )
-        sigma_z_m = noise_parameters.sigma_z_m
-        sigma_a_to_sigma_z_ratios = [
-            sigma_a_factor * noise_parameters.sigma_a_m_s2 / sigma_z_m
-            for sigma_a_factor in sigma_a_factors
-        ]
         downsampled_motion = self.downsample(COARSE_SEARCH_MEASUREMENT_COUNT)
-        position_batches = downsampled_motion.make_position_batches(
-            tested_offsets_s, estimates_scale=estimates_scale
-        )
-        fits_by_sigma_ratio = fit_with_sigma_ratios(
-            position_batches,
-            sigma_a_to_sigma_z_ratios,
-            noise_parameters.random_walk_m / sigma_z_m,
-            downsampled_motion.measurement_weights,
-            sigma_z_m,
-        )
-        # Shape (SIGMA_A factors, time offsets)
+        position_batches = [
+            *downsampled_motion.make_position_batches(
+                tested_offsets_s, estimates_scale=estimates_scale
+            )
+        ]
+        candidates = [
+            replace(noise_parameters, sigma_a_m_s2=factor * noise_parameters.sigma_a_m_s2)
+            for factor in sigma_a_factors
+        ]
+        # Rows: SIGMA_A; columns: time offsets
         minus_log_likelihood = np.concatenate(
             [
-                ratio_fit.scale_sigmas(sigma_z_m).compute_scores()
-                for ratio_fit in fits_by_sigma_ratio
+                fit_constant_errors(
+                    position_batches, candidate, downsampled_motion.measurement_weights
+                ).compute_scores()
+                for candidate in candidates
             ]
         )
-        factor_index, offset_index = np.unravel_index(
-            np.argmin(minus_log_likelihood), minus_log_likelihood.shape
-        )
-        return float(tested_offsets_s[offset_index]), replace(
-            noise_parameters,
-            sigma_a_m_s2=noise_parameters.sigma_a_m_s2 * sigma_a_factors[int(factor_index)],
-        )
+        best_row, best_column = divmod(int(np.argmin(minus_log_likelihood)), COARSE_OFFSET_COUNT)
+        return float(tested_offsets_s[best_column]), candidates[best_row]
 
 
 def compute_imu_motion(
@@ -329,41 +351,18 @@ def compute_imu_motion(
     if isinstance(attitude, Unavailable):
         return attitude
     motion_cache = {} if motion_cache is None else motion_cache
-    segment_motions: list[SegmentMotion] = []
     imu_time_s = imu.index.to_numpy()
-    attitude_time_s = attitude.index.to_numpy()
-    rows_by_segment: list[IntArray] = []
-    for begin_s, end_s in _find_covered_spans(imu_time_s, attitude_time_s):
-        rows_with_imu_data = np.flatnonzero(
-            (time_s >= begin_s + MAX_TESTED_TIME_OFFSET_S)
-            & (time_s <= end_s - MAX_TESTED_TIME_OFFSET_S)
+    covered_spans_s = _find_covered_spans(imu_time_s, attitude.index.to_numpy())
+    rows_by_segment = _split_into_segments(time_s, covered_spans_s, max_segment_duration_s)
+    segment_motions = []
+    for rows in rows_by_segment:
+        imu_span_s = (
+            time_s[rows[0]] - MAX_TESTED_TIME_OFFSET_S,
+            time_s[rows[-1]] + MAX_TESTED_TIME_OFFSET_S,
         )
-        if not len(rows_with_imu_data):
-            continue
-        times_with_imu_data_s = time_s[rows_with_imu_data]
-        segment_count = max(
-            1,
-            int(
-                np.ceil(
-                    (times_with_imu_data_s[-1] - times_with_imu_data_s[0]) / max_segment_duration_s
-                )
-            ),
-        )
-        cut_times_s = np.linspace(
-            times_with_imu_data_s[0], times_with_imu_data_s[-1], segment_count + 1
-        )[1:-1]
-        for segment_rows in np.split(
-            rows_with_imu_data, np.searchsorted(times_with_imu_data_s, cut_times_s)
-        ):
-            if len(segment_rows) >= MIN_SEGMENT_MEASUREMENTS:
-                rows_by_segment.append(segment_rows)
-                imu_span_s = (
-                    time_s[segment_rows[0]] - MAX_TESTED_TIME_OFFSET_S,
-                    time_s[segment_rows[-1]] + MAX_TESTED_TIME_OFFSET_S,
-                )
-                if imu_span_s not in motion_cache:
-                    motion_cache[imu_span_s] = make_segment_motion(imu, attitude, imu_span_s)
-                segment_motions.append(motion_cache[imu_span_s])
+        if imu_span_s not in motion_cache:
+            motion_cache[imu_span_s] = make_segment_motion(imu, attitude, imu_span_s)
+        segment_motions.append(motion_cache[imu_span_s])
     used_rows = np.concatenate([np.zeros(0, dtype=np.intp), *rows_by_segment])
     if len(used_rows) < MIN_TOTAL_MEASUREMENTS:
         return Unavailable(
@@ -373,7 +372,8 @@ def compute_imu_motion(
             "Analyse a longer segment.",
         )
     segment_edges = np.cumsum([0, *map(len, rows_by_segment)])
-    # Positions relative to the first position of a segment have smaller rounding errors
+    # Positions relative to the first position of a segment have smaller rounding errors. "first" is
+    # the first position of each axis that is not missing
     measured_m = pd.DataFrame(measurement_m[used_rows])
     segment_index = np.repeat(np.arange(len(rows_by_segment)), np.diff(segment_edges))
     first_position_m = measured_m.groupby(segment_index).transform("first")
@@ -390,6 +390,28 @@ def compute_imu_motion(
     )
 
 
+def _split_into_segments(
+    time_s: Array, covered_spans_s: list[Span], max_segment_duration_s: float
+) -> list[IntArray]:
+    """Return the rows of the positions in each segment.
+
+    A segment is inside a span with IMU data, with a margin for the tested time offsets.
+    """
+    rows_by_segment = []
+    for begin_s, end_s in covered_spans_s:
+        rows = np.flatnonzero(
+            (time_s >= begin_s + MAX_TESTED_TIME_OFFSET_S)
+            & (time_s <= end_s - MAX_TESTED_TIME_OFFSET_S)
+        )
+        if not len(rows):
+            continue
+        first_s, last_s = time_s[rows[[0, -1]]]
+        segment_count = max(1, int(np.ceil((last_s - first_s) / max_segment_duration_s)))
+        cut_times_s = np.linspace(first_s, last_s, segment_count + 1)[1:-1]
+        rows_by_segment += np.split(rows, np.searchsorted(time_s[rows], cut_times_s))
+    return [rows for rows in rows_by_segment if len(rows) >= MIN_SEGMENT_MEASUREMENTS]
+
+
 def _find_covered_spans(imu_time_s: Array, attitude_time_s: Array) -> list[Span]:
     """Find time spans (s) without a gap in IMU or attitude; none if the IMU rate is too low."""
     if len(imu_time_s) < 2 or compute_median_interval_s(imu_time_s) > MAX_IMU_INTERVAL_S:
@@ -404,23 +426,19 @@ def make_segment_motion(
     imu: pd.DataFrame, attitude: pd.DataFrame, imu_span_s: Span
 ) -> SegmentMotion:
     """Compute the motion in NED from the IMU, and its derivatives with respect to IMU errors."""
-    imu_time_s = imu.index.to_numpy()
+    margin_s = 2 * INTEGRATION_STEP_S
     first_row, end_row = np.searchsorted(
-        imu_time_s,
-        [imu_span_s[0] - 2 * INTEGRATION_STEP_S, imu_span_s[1] + 2 * INTEGRATION_STEP_S],
-        side="left",
+        imu.index.to_numpy(), [imu_span_s[0] - margin_s, imu_span_s[1] + margin_s]
     )
-    imu_time_s = imu_time_s[first_row:end_row]
+    imu = imu.iloc[first_row:end_row]
+    imu_time_s = imu.index.to_numpy()
     step_times_s = np.arange(imu_time_s[0], imu_time_s[-1], INTEGRATION_STEP_S)
-    imu_integrals = (
-        integrate_cumulatively(imu[name].to_numpy()[first_row:end_row], imu_time_s)
-        for name in (*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE)
+    specific_force_integral_m_s, gyro_integral_rad = (
+        interpolate_columns(
+            step_times_s, imu_time_s, integrate_cumulatively(imu[names].to_numpy(), imu_time_s)
+        )
+        for names in (Columns.SPECIFIC_FORCE, Columns.ANGULAR_RATE)
     )
-    imu_integrals_at_steps = np.column_stack(
-        [np.interp(step_times_s, imu_time_s, integral) for integral in imu_integrals]
-    )
-    specific_force_integral_m_s = imu_integrals_at_steps[:, :3]
-    gyro_integral_rad = imu_integrals_at_steps[:, 3:]
     # The first selected attitude sample is before the first step, for interpolation at this step
     attitude_time_s = attitude.index.to_numpy()
     first_row, end_row = np.searchsorted(attitude_time_s, step_times_s[[0, -1]], side="right")
@@ -439,36 +457,34 @@ def make_segment_motion(
             ]
         )
     )
-    # The mean specific force of each step is rotated by the attitude in the middle of the step
+    # Arrays below have one row for each step. The mean specific force f of a step is rotated by the
+    # attitude in the middle of the step
     mean_specific_force_m_s2 = np.diff(specific_force_integral_m_s, axis=0) / INTEGRATION_STEP_S
-    body_to_ned = to_matrix(
+    body_to_ned = to_rotation_matrix(
         multiply(
             attitude_quaternion[:-1], from_rotation_vector(np.diff(gyro_integral_rad, axis=0) / 2.0)
         )
     )
-    specific_force_ned_m_s2 = rotate(body_to_ned, mean_specific_force_m_s2).T
-    body_to_ned = np.moveaxis(body_to_ned, 0, -1)
-    motion_and_imu_error_derivatives = np.zeros(
-        (2, 3, len(PRIOR_SIGMAS_OF_CONSTANT_ERRORS), len(mean_specific_force_m_s2))
+    specific_force_ned_m_s2 = rotate(body_to_ned, mean_specific_force_m_s2)
+    acceleration_ned_m_s2 = specific_force_ned_m_s2 + np.array([0.0, 0.0, constants.g])
+    # An attitude error θ adds θ × f = -[f]× θ to the acceleration; a gyro bias b causes
+    # θ = -∫ R b dt; an accelerometer bias b adds -R b
+    acceleration_by_attitude_error = -skew(specific_force_ned_m_s2)
+    attitude_error_by_gyro_bias = -INTEGRATION_STEP_S * (
+        np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0
     )
+    acceleration_and_derivatives = np.concatenate(
+        [
+            acceleration_ned_m_s2[:, :, None],
+            acceleration_by_attitude_error,
+            acceleration_by_attitude_error @ attitude_error_by_gyro_bias,
+            -body_to_ned,
+        ],
+        axis=2,
+    )
+    acceleration = np.ascontiguousarray(np.moveaxis(acceleration_and_derivatives, 0, -1))
+    motion_and_imu_error_derivatives = np.zeros((2, *acceleration.shape))
     position, velocity = motion_and_imu_error_derivatives
-    acceleration = np.zeros_like(velocity)
-    acceleration[:, 0] = specific_force_ned_m_s2
-    acceleration[2, 0] += constants.g
-    # An attitude error θ adds θ × f to the acceleration; a gyro bias b causes θ = -∫ R b dt
-    attitude_error_by_unit_gyro_bias = -INTEGRATION_STEP_S * (
-        np.cumsum(body_to_ned, axis=-1) - body_to_ned / 2.0
-    )
-    for axis in range(3):
-        second_axis = (axis + 1) % 3
-        third_axis = (axis + 2) % 3
-        acceleration[second_axis, 1 + axis] = -specific_force_ned_m_s2[third_axis]
-        acceleration[third_axis, 1 + axis] = specific_force_ned_m_s2[second_axis]
-        acceleration[axis, 4:7] = (
-            attitude_error_by_unit_gyro_bias[second_axis] * specific_force_ned_m_s2[third_axis]
-            - attitude_error_by_unit_gyro_bias[third_axis] * specific_force_ned_m_s2[second_axis]
-        )
-    acceleration[:, 7:10] = -body_to_ned
     velocity_increments = acceleration[..., :-1] * INTEGRATION_STEP_S
     np.cumsum(velocity_increments, axis=-1, out=velocity[..., 1:])
     mean_velocity_in_step = velocity[..., :-1] + velocity_increments / 2.0

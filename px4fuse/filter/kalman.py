@@ -97,12 +97,12 @@ def run_kf(axis: Axis, settings: Settings, *, fast: bool = False) -> KfRun:
     # No step follows the last state
     steps["acceleration_m_s2"] = np.append(prediction_steps.acceleration_m_s2, 0.0)
     steps["imu_gap_variance_m2_s4"] = np.append(prediction_steps.imu_gap_variance_m2_s4, 0.0)
-    is_update = prediction_steps.measurement_index >= 0
+    update_rows = prediction_steps.last_steps
     return KfRun(
         axis,
         settings,
         steps,
-        pd.DataFrame(updates[is_update], steps.index[is_update], UPDATE_TABLE_COLUMNS),
+        pd.DataFrame(updates[update_rows], steps.index[update_rows], UPDATE_TABLE_COLUMNS),
         prediction_steps.input_gap_s,
     )
 

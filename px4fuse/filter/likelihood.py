@@ -13,7 +13,7 @@ from scipy.linalg import lapack
 from scipy.optimize import brentq, minimize_scalar
 from scipy.special import chdtri
 
-from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray
 from px4fuse.filter.model import (
     INITIAL_COVARIANCE,
     SymmetricElements,
@@ -32,9 +32,9 @@ MAX_LOG_LIKELIHOOD_DROP = float(chdtri(1, 0.05)) / 2.0
 INITIAL_LOG_SIGMA_SEARCH_STEP = 0.05
 # For each tested SIGMA_A, the most likely SIGMA_Z is searched, or vice versa. In this search, ln σ
 # changes at most by this value from the result for the previous tested SIGMA_A (or SIGMA_Z)
-MAX_OTHER_LOG_SIGMA_CHANGE = 1.0
+MAX_OTHER_NOISE_LOG_SIGMA_CHANGE = 1.0
 # Tolerance of ln σ in the search for the most likely SIGMA_Z for a given SIGMA_A, or vice versa
-OTHER_LOG_SIGMA_TOLERANCE = 2e-3
+OTHER_NOISE_LOG_SIGMA_TOLERANCE = 2e-3
 
 
 @dataclass(frozen=True)
@@ -72,21 +72,21 @@ def preintegrate(axis: Axis, settings: Settings) -> PreintegratedMotion:
         ``settings.input`` is "imu" and the axis has no acceleration.
     """
     prediction_steps = make_prediction_steps(axis, settings)
-    last_steps, interval_index, time_from_step_to_interval_end_s = _assign_steps_to_intervals(
-        prediction_steps
-    )
-    step_times_s = prediction_steps.time_s
+    last_steps, step_times_s = prediction_steps.last_steps, prediction_steps.time_s
+    # Covariance at the end of the interval due to the acceleration noise in one step
     process_noise_per_sigma_a_squared = settings.dt_s * np.stack(
         propagate_covariance(
             compute_process_noise_per_density(np.diff(step_times_s)),
-            time_from_step_to_interval_end_s,
+            prediction_steps.compute_time_to_interval_end_s(),
         ),
         1,
     )
     dp, dv = integrate_acceleration(prediction_steps, prediction_steps.acceleration_m_s2)
 
     def sum_by_interval(values: Array) -> Array:
-        return np.stack([np.bincount(interval_index, column) for column in values.T], 1)
+        return np.stack(
+            [np.bincount(prediction_steps.interval_index, column) for column in values.T], 1
+        )
 
     return PreintegratedMotion(
         interval_s=np.diff(step_times_s[np.append(0, last_steps)]),
@@ -108,39 +108,16 @@ def integrate_acceleration(
 
     ``acceleration_m_s2`` contains the acceleration in each prediction step.
     """
-    _, interval_index, time_from_step_to_interval_end_s = _assign_steps_to_intervals(
-        prediction_steps
+    step_s = np.diff(prediction_steps.time_s)
+    zeros = np.zeros(len(step_s))
+    # The velocity change of a step moves the vehicle until the end of the interval
+    dp, dv = propagate_state(zeros, zeros, acceleration_m_s2, step_s)
+    dp, dv = propagate_state(dp, dv, zeros, prediction_steps.compute_time_to_interval_end_s())
+    dp, dv = (
+        np.bincount(prediction_steps.interval_index, increment).astype(float)
+        for increment in (dp, dv)
     )
-    zeros = np.zeros(len(time_from_step_to_interval_end_s))
-    dp, dv = propagate_state(
-        *propagate_state(zeros, zeros, acceleration_m_s2, np.diff(prediction_steps.time_s)),
-        zeros,
-        time_from_step_to_interval_end_s,
-    )
-    dp, dv = (np.bincount(interval_index, increment).astype(float) for increment in (dp, dv))
     return dp, dv
-
-
-def _assign_steps_to_intervals(
-    prediction_steps: PredictionSteps,
-) -> tuple[IntArray, IntArray, Array]:
-    """Assign each prediction step to an interval between measurements.
-
-    Returns
-    -------
-    last_steps : ndarray
-        Index of the last step of each interval.
-    interval_index : ndarray
-        Index of the interval that contains each step.
-    time_from_step_to_interval_end_s : ndarray
-        Time from the end of each step to the end of its interval.
-    """
-    last_steps = np.flatnonzero(prediction_steps.measurement_index >= 0)
-    interval_index = np.searchsorted(last_steps, np.arange(1, len(prediction_steps.time_s)))
-    time_from_step_to_interval_end_s = (
-        prediction_steps.time_s[last_steps[interval_index]] - prediction_steps.time_s[1:]
-    )
-    return last_steps, interval_index, time_from_step_to_interval_end_s
 
 
 def innovations(
@@ -176,47 +153,53 @@ def compute_gains(
         sigma_a_m_s2 * sigma_a_m_s2 * preintegrated_motion.process_noise_per_sigma_a_squared
         + preintegrated_motion.process_noise_independent_of_sigma_a
     )
+    if is_skipped is None:
+        is_skipped = np.zeros(len(process_noise), bool)
     covariance: SymmetricElements[float] = INITIAL_COVARIANCE
     variance_and_gains_by_measurement = []
     for dt, (q00, q01, q11), skips_update in zip(
         preintegrated_motion.interval_s.tolist(),
         process_noise.tolist(),
-        [False] * len(preintegrated_motion.interval_s)
-        if is_skipped is None
-        else is_skipped.tolist(),
+        is_skipped.tolist(),
         strict=True,
     ):
         p00, p01, p11 = propagate_covariance(covariance, dt)  # P = FPFᵀ + Q
         covariance = p00 + q00, p01 + q01, p11 + q11
-        (_, s, k0, k1), (_, _, updated_covariance) = update_step(
+        (_, s, position_gain, velocity_gain), (_, _, updated_covariance) = update_step(
             0.0, 0.0, covariance, 0.0, sigma_z_m * sigma_z_m
         )
-        variance_and_gains_by_measurement.append((s, 0.0, 0.0) if skips_update else (s, k0, k1))
-        covariance = covariance if skips_update else updated_covariance
+        if skips_update:
+            position_gain = velocity_gain = 0.0
+        else:
+            covariance = updated_covariance
+        variance_and_gains_by_measurement.append((s, position_gain, velocity_gain))
     return np.array(variance_and_gains_by_measurement).T
 
 
 def compute_innovations_with_gains(
-    preintegrated_motion: PreintegratedMotion, k0: Array, k1: Array
+    preintegrated_motion: PreintegratedMotion, position_gain: Array, velocity_gain: Array
 ) -> Array:
     """Run KF with given position and velocity gains; return the innovation ν (m)."""
-    # The predicted states solve linear equations, so LAPACK computes all of them at once
+    # The predicted states (p, v) solve linear equations, so LAPACK computes all of them at once:
+    # p_i - (1 - k0 - dt k1) p_(i-1) - dt v_(i-1) = Δp + (k0 + dt k1) z_(i-1)
+    # v_i + k1 p_(i-1) - v_(i-1) = Δv + k1 z_(i-1)
     dt = preintegrated_motion.interval_s[1:]
-    position_gain = k0[:-1] + dt * k1[:-1]
+    predicted_position_gain = position_gain[:-1] + dt * velocity_gain[:-1]
     measured_m = np.ascontiguousarray(preintegrated_motion.measurement_m.T)
     right_hand_side = np.empty((*measured_m.shape, 2))
     right_hand_side[..., 0] = preintegrated_motion.delta_position_m.T
     right_hand_side[..., 1] = preintegrated_motion.delta_velocity_m_s.T
-    right_hand_side[..., 1:, 0] += position_gain * measured_m[..., :-1]
-    right_hand_side[..., 1:, 1] += k1[:-1] * measured_m[..., :-1]
-    bands = np.zeros((len(k0), 2, 4))
+    right_hand_side[..., 1:, 0] += predicted_position_gain * measured_m[..., :-1]
+    right_hand_side[..., 1:, 1] += velocity_gain[:-1] * measured_m[..., :-1]
+    # Coefficients below the unit diagonal: unknown (p or v of each measurement), then distance
+    bands = np.zeros((len(position_gain), 2, 4))
     bands[:-1, 1, 1] = -dt
-    bands[:-1, 0, 2] = position_gain - 1.0
+    bands[:-1, 0, 2] = predicted_position_gain - 1.0
     bands[:-1, 1, 2] = -1.0
-    bands[:-1, 0, 3] = k1[:-1]
+    bands[:-1, 0, 3] = velocity_gain[:-1]
     state, _ = lapack.dtbtrs(
         bands.reshape(-1, 4).T,
-        right_hand_side.reshape(-1, 2 * len(k0)).T,
+        right_hand_side.reshape(-1, 2 * len(position_gain)).T,
         uplo="L",
         diag="U",
         overwrite_b=1,
@@ -285,9 +268,11 @@ def find_profile_likelihood_interval(
     def find_interval_end(direction: float, search_limit: float) -> float | None:
         other_log_sigma = best_log_sigmas[1]
 
-        # √(decrease of the log-likelihood) is nearly linear in ln σ, so brentq needs few steps
+        # The interval ends where this function is zero. √(decrease of the log-likelihood) is nearly
+        # linear in ln σ, so brentq needs few steps
         @cache
         def compute_log_likelihood_drop_excess(log_sigma_change: float) -> float:
+            # The search for the other parameter starts at the result for the previous change
             nonlocal other_log_sigma
             if log_sigma_change == 0.0:
                 return -max_sqrt_log_likelihood_drop
@@ -296,10 +281,10 @@ def find_profile_likelihood_interval(
                     best_log_sigmas[0] + direction * log_sigma_change, tested_other_log_sigma
                 ),
                 bounds=(
-                    other_log_sigma - MAX_OTHER_LOG_SIGMA_CHANGE,
-                    other_log_sigma + MAX_OTHER_LOG_SIGMA_CHANGE,
+                    other_log_sigma - MAX_OTHER_NOISE_LOG_SIGMA_CHANGE,
+                    other_log_sigma + MAX_OTHER_NOISE_LOG_SIGMA_CHANGE,
                 ),
-                options={"xatol": OTHER_LOG_SIGMA_TOLERANCE},
+                options={"xatol": OTHER_NOISE_LOG_SIGMA_TOLERANCE},
             )
             other_log_sigma = float(best_other_sigma_fit.x)
             return float(
@@ -308,6 +293,7 @@ def find_profile_likelihood_interval(
             )
 
         max_log_sigma_change = direction * (float(np.log(search_limit)) - best_log_sigmas[0])
+        # Increase the change until the decrease is too large: the end is before this change
         tried_log_sigma_change = min(INITIAL_LOG_SIGMA_SEARCH_STEP, max_log_sigma_change)
         while compute_log_likelihood_drop_excess(tried_log_sigma_change) < 0.0:
             if tried_log_sigma_change == max_log_sigma_change:

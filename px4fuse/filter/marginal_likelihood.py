@@ -17,7 +17,7 @@ Symbols in shapes: m measurements, a axes, s segments, T time offsets, c constan
 
 from __future__ import annotations
 
-import math
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -36,8 +36,6 @@ PATH_SMOOTHER_SIGMA_A_M_S2, PATH_SMOOTHER_SIGMA_Z_M = 0.5, 0.1
 MIN_PRECISION_OF_KNOWN_STATE = 1e-3
 # Q can be singular, so a small variance is added to Q₀₀: its σ as a fraction of √(R + Q₀₀)
 REGULARISATION_TO_POSITION_SIGMA_RATIO = 1e-5
-# Maximum number of array elements at once, to limit the memory
-MAX_BATCH_ELEMENTS = 2**16
 # Number of inner products that are computed at once, to limit the memory
 INNER_PRODUCTS_PER_BATCH = 8
 # Minimum ratio |Q| / (Q₀₀ Q₁₁): a smaller determinant is a rounding error
@@ -55,7 +53,7 @@ class PositionsAndIncrements:
     ----------
     measurement_m : ndarray, shape (m, a)
         Measured positions; NaN if an axis has none.
-    segment_starts : ndarray of int, shape (s,)
+    segment_start_indices : ndarray of int, shape (s,)
         Index of the first measurement of each segment.
     interval_s : ndarray, shape (m - 1,)
         Intervals between measurements.
@@ -75,7 +73,7 @@ class PositionsAndIncrements:
     """
 
     measurement_m: Array
-    segment_starts: IntArray
+    segment_start_indices: IntArray
     interval_s: Array
     process_noise_per_sigma_a_squared: Array
     process_noise_independent_of_sigma_a: Array
@@ -88,7 +86,7 @@ class PositionsAndIncrements:
     @cached_property
     def is_within_segment(self) -> BoolArray:
         """True for each interval whose two measurements are in the same segment, shape (m - 1,)."""
-        return ~np.isin(np.arange(1, len(self.measurement_m)), self.segment_starts)
+        return ~np.isin(np.arange(1, len(self.measurement_m)), self.segment_start_indices)
 
     def first(self, count: int) -> PositionsAndIncrements:
         """Keep the first ``count`` measurements only."""
@@ -96,7 +94,7 @@ class PositionsAndIncrements:
         return replace(
             self,
             measurement_m=self.measurement_m[:count],
-            segment_starts=self.segment_starts[self.segment_starts < count],
+            segment_start_indices=self.segment_start_indices[self.segment_start_indices < count],
             prior_precision=self.prior_precision[:count],
             **{
                 name: getattr(self, name)[interval_rows]
@@ -108,33 +106,6 @@ class PositionsAndIncrements:
                     "delta_velocity_m_s",
                 )
             },
-        )
-
-    def divide_sigmas_by_sigma_z(
-        self, sigma_z_m: float, random_walk_to_sigma_z_ratio: float, measurement_weights: Array
-    ) -> tuple[PositionsAndIncrements, Array]:
-        """Divide all σ by SIGMA_Z; return the result and the variance of each measurement.
-
-        The variance of a measurement is 1 / weight. ``measurement_weights`` may omit the first
-        rows of the positions, which are initial states without a measurement; their variance is 1
-        and has no effect. ``random_walk_to_sigma_z_ratio`` has the unit 1/√s.
-        """
-        process_noise_independent_of_sigma_a = (
-            self.process_noise_independent_of_sigma_a / sigma_z_m**2
-        )
-        process_noise_independent_of_sigma_a[0] += self.interval_s * random_walk_to_sigma_z_ratio**2
-        weights_of_initial_states = np.ones(len(self.measurement_m) - len(measurement_weights))
-        correlated_noise = self.correlated_noise
-        if correlated_noise:
-            correlated_noise = correlated_noise[0] / sigma_z_m, correlated_noise[1]
-        positions_over_sigma_z = replace(
-            self,
-            process_noise_independent_of_sigma_a=process_noise_independent_of_sigma_a,
-            prior_precision=self.prior_precision * sigma_z_m**2,
-            correlated_noise=correlated_noise,
-        )
-        return positions_over_sigma_z, 1.0 / np.concatenate(
-            [weights_of_initial_states, measurement_weights]
         )
 
     def factorise_equations(
@@ -150,25 +121,26 @@ class PositionsAndIncrements:
             sigma_a_m_s2**2 * self.process_noise_per_sigma_a_squared
             + self.process_noise_independent_of_sigma_a
         )
-        remaining_axes = list(range(is_measured.shape[1]))
-        while remaining_axes:
-            is_axis_measured = is_measured[:, remaining_axes[0]]
-            axes = [
-                axis
-                for axis in remaining_axes
-                if np.array_equal(is_measured[:, axis], is_axis_measured)
-            ]
-            remaining_axes = [axis for axis in remaining_axes if axis not in axes]
+        axes_by_measured_rows = defaultdict[bytes, list[int]](list)
+        for axis, is_axis_measured in enumerate(is_measured.T):
+            axes_by_measured_rows[is_axis_measured.tobytes()].append(axis)
+        for axes in axes_by_measured_rows.values():
+            is_axis_measured = is_measured[:, axes[0]]
             measurement_and_prior_precision = self.prior_precision.copy()
             # A segment with fewer than two measurements does not contribute to the likelihood
             has_too_few_measurements = (
-                np.add.reduceat(is_axis_measured.astype(int), self.segment_starts) < 2
+                np.add.reduceat(is_axis_measured.astype(int), self.segment_start_indices) < 2
             )
             is_used = is_axis_measured & ~np.repeat(
-                has_too_few_measurements, np.diff([*self.segment_starts, len(is_measured)])
+                has_too_few_measurements, np.diff([*self.segment_start_indices, len(is_measured)])
             )
             measurement_and_prior_precision[:, 0] += np.where(is_used, 1.0 / variance_m2, 0.0)
-            measurement_and_prior_precision[self.segment_starts[has_too_few_measurements]] += 1.0
+            # Any precision of its initial state makes its equations regular, without other effect
+            measurement_and_prior_precision[
+                self.segment_start_indices[has_too_few_measurements]
+            ] += 1.0
+            # A measured state, or an initial state with a strong prior, adds a degree of freedom.
+            # Two of them per segment determine its initial position and velocity
             is_known = (measurement_and_prior_precision > 0.0) & (
                 (measurement_and_prior_precision > self.prior_precision)
                 | (self.prior_precision > MIN_PRECISION_OF_KNOWN_STATE)
@@ -181,19 +153,16 @@ class PositionsAndIncrements:
                 self.correlated_noise,
             )
             # The weak prior of an unknown initial state must not contribute to the likelihood
-            log_precision_of_unknown_states = float(
-                np.sum(
-                    np.log(
-                        measurement_and_prior_precision[
-                            (measurement_and_prior_precision > 0.0) & ~is_known
-                        ]
-                    )
-                )
-            )
+            is_weak_prior = (measurement_and_prior_precision > 0.0) & ~is_known
+            log_precisions = np.log(measurement_and_prior_precision[is_weak_prior])
             system = replace(
-                system, log_determinant=system.log_determinant + log_precision_of_unknown_states
+                system, log_determinant=system.log_determinant + float(np.sum(log_precisions))
             )
-            yield axes, system, int(np.count_nonzero(is_known)) - 2 * len(self.segment_starts)
+            yield (
+                axes,
+                system,
+                int(np.count_nonzero(is_known)) - 2 * len(self.segment_start_indices),
+            )
 
 
 @dataclass(frozen=True)
@@ -218,15 +187,6 @@ class PositionFit:
     degrees_of_freedom: int
     prior_sigmas_of_constant_errors: Array
 
-    def scale_sigmas(self, factor: float) -> PositionFit:
-        """Return the fit with the σ of all noises multiplied by ``factor``."""
-        return replace(
-            self,
-            gram_matrix=self.gram_matrix / factor**2,
-            covariance_log_determinant=self.covariance_log_determinant
-            + 2.0 * self.degrees_of_freedom * math.log(factor),
-        )
-
     def compute_constant_error_information(self) -> Array:
         """Return information matrices of the constant errors, shape (segments, offsets, c, c)."""
         return self.gram_matrix[..., 1:, 1:] + np.diag(self.prior_sigmas_of_constant_errors**-2.0)
@@ -250,22 +210,20 @@ class PositionFit:
         All σ are multiplied by each of ``sigma_factors``. A term that is equal for all time offsets
         is omitted.
         """
-        gram_matrix_over_sigma_factor_squared = (
-            self.gram_matrix / sigma_factors[:, None, None, None, None] ** 2
-        )
+        scaled_gram_matrix = self.gram_matrix / sigma_factors[:, None, None, None, None] ** 2
+        # Row and column 0: the data. Other rows and columns: the constant errors, which are
+        # estimated in units of their prior σ
         prior_sigmas = self.prior_sigmas_of_constant_errors
-        normalised_information_matrix = gram_matrix_over_sigma_factor_squared[
-            ..., 1:, 1:
-        ] * np.outer(prior_sigmas, prior_sigmas) + np.eye(len(prior_sigmas))
-        normalised_right_hand_side = (
-            gram_matrix_over_sigma_factor_squared[..., 1:, 0] * prior_sigmas
-        )
+        normalised_information_matrix = scaled_gram_matrix[..., 1:, 1:] * np.outer(
+            prior_sigmas, prior_sigmas
+        ) + np.eye(len(prior_sigmas))
+        normalised_right_hand_side = scaled_gram_matrix[..., 1:, 0] * prior_sigmas
         cholesky_factor = np.linalg.cholesky(normalised_information_matrix)
         estimated_constants = np.linalg.solve(
             normalised_information_matrix, normalised_right_hand_side[..., None]
         )[..., 0]
         half_log_determinant = np.log(np.diagonal(cholesky_factor, axis1=-2, axis2=-1)).sum(axis=-1)
-        square_sum = gram_matrix_over_sigma_factor_squared[..., 0, 0] - np.sum(
+        square_sum = scaled_gram_matrix[..., 0, 0] - np.sum(
             normalised_right_hand_side * estimated_constants, axis=-1
         )
         return np.asarray(0.5 * square_sum + half_log_determinant)
@@ -305,10 +263,8 @@ def fit_positions(
     measured_input_count = measured_m.shape[2]
     dp = positions.delta_position_m
     dv = positions.delta_velocity_m_s
-    segment_count = len(positions.segment_starts)
-    segment_edges = np.append(positions.segment_starts, len(positions.measurement_m))
-    batch_count = -(-dp.size // MAX_BATCH_ELEMENTS)
-    gram_matrix = np.zeros((segment_count, *dp.shape[1:3], dp.shape[2]))
+    segment_edges = np.append(positions.segment_start_indices, len(positions.measurement_m))
+    gram_matrix = np.zeros((len(segment_edges) - 1, *dp.shape[1:3], dp.shape[2]))
     log_determinant = 0.0
     degrees_of_freedom = 0
     for axes, system, axis_degrees_of_freedom in positions.factorise_equations(
@@ -316,29 +272,26 @@ def fit_positions(
     ):
         log_determinant += len(axes) * system.log_determinant
         degrees_of_freedom += len(axes) * axis_degrees_of_freedom
-        # Process some segments at once: single segments are slow, and all segments need much memory
-        for batch in np.array_split(np.arange(segment_count), min(batch_count, segment_count)):
-            begin, end = segment_edges[[batch[0], batch[-1] + 1]]
-            edges = segment_edges[batch[0] : batch[-1] + 2] - begin
-            rows, interval_index = slice(begin, end), np.s_[axes, ..., begin : end - 1]
-            batch_measured_m = measured_m[axes, ..., rows]
-            increments = dp[interval_index], dv[interval_index]
-            batch_system = system.select_rows(rows)
-            weighted_increments = batch_system.weight_increments(*increments)
-            whitened_explained_part = batch_system.whiten_explained_part(
-                batch_measured_m, *weighted_increments
+        # One axis after the other: twice as fast in a long flight, because the arrays are smaller
+        for rows in (slice(axis, axis + 1) for axis in axes):
+            measured_axis_m, increments = measured_m[rows], (dp[rows], dv[rows])
+            weighted_increments = system.weight_increments(*increments)
+            whitened_explained_part = system.whiten_explained_part(
+                measured_axis_m, *weighted_increments
             )
+            # Inner product of two inputs: ΔᵀQ⁻¹Δ of the increments Δ, plus zᵀR⁻¹z of the positions
+            # z (below), minus the part that the estimated states explain
             for sign, left, right, values_per_measurement in (
                 (1.0, increments[0], weighted_increments[0], 1),
                 (1.0, increments[1], weighted_increments[1], 1),
                 (-1.0, whitened_explained_part, whitened_explained_part, system.state_count),
             ):
-                gram_matrix[batch] += sign * _compute_inner_products(
-                    left, right, values_per_measurement * edges
+                gram_matrix += sign * _compute_inner_products(
+                    left, right, values_per_measurement * segment_edges
                 )
-            gram_matrix[batch, :, :measured_input_count, :measured_input_count] += (
+            gram_matrix[..., :measured_input_count, :measured_input_count] += (
                 _compute_inner_products(
-                    system.precision[rows, 0] * batch_measured_m, batch_measured_m, edges
+                    system.precision[:, 0] * measured_axis_m, measured_axis_m, segment_edges
                 )
             )
     return PositionFit(
@@ -380,8 +333,9 @@ def subtract_smooth_path(
         measured_m_by_axis = np.repeat(
             np.nan_to_num(measured_m[:, axes].T)[:, None], dp.shape[1], 1
         )
+        # Input 0 is the data, the last input is the scale factor error
         smoothed_state = system.solve(measured_m_by_axis, dp[axes, :, 0], dv[axes, :, 0])
-        smoothed_state[:, :, positions.segment_starts] = 0.0
+        smoothed_state[:, :, positions.segment_start_indices] = 0.0
         path_m = smoothed_state[..., 0]
         path_velocity_m_s = smoothed_state[..., 1]
         measured_m[:, axes] -= path_m[:, 0].T
@@ -413,14 +367,14 @@ def estimate_squared_errors(
     constant_errors : ndarray, shape (segments, c)
         Estimated constant errors (such as biases).
     """
-    data_and_derivative_weights = np.concatenate(
-        [np.ones((len(constant_errors), 1)), constant_errors], axis=1
-    )
-    data_and_derivative_weights_by_interval = np.repeat(
-        data_and_derivative_weights, np.diff([*positions.segment_starts, len(variance_m2)]), axis=0
+    # Increments without constant errors: data + Σ constant error · derivative
+    input_weights = np.insert(constant_errors, 0, 1.0, axis=1)
+    # An interval is in the segment of the measurement at its end
+    input_weights_by_interval = np.repeat(
+        input_weights, np.diff([*positions.segment_start_indices, len(variance_m2)]), axis=0
     )[1:]
     dp, dv = (
-        np.einsum("akn,nk->an", increments[:, 0], data_and_derivative_weights_by_interval)
+        np.einsum("akn,nk->an", increments[:, 0], input_weights_by_interval)
         for increments in (positions.delta_position_m, positions.delta_velocity_m_s)
     )
     expected_squared_error_m2 = np.zeros(len(variance_m2))
@@ -462,6 +416,7 @@ def compute_segment_inner_products(
     inner_products_by_batch = []
     for begin in range(0, right_factor_positions_m.shape[1], INNER_PRODUCTS_PER_BATCH):
         batch = np.s_[:, begin : begin + INNER_PRODUCTS_PER_BATCH]
+        # Inputs: each u, each v (without increments), and each constant error (without positions)
         dp, dv = (
             np.concatenate(
                 [increment[batch], 0.0 * increment[batch], increment_per_constant_error], axis=1
@@ -470,32 +425,25 @@ def compute_segment_inner_products(
                 increments, increments_per_constant_error, strict=True
             )
         )
-        left_rows, right_rows, constant_error_rows = np.split(
-            np.arange(dp.shape[2]), np.array([1, 2]) * left_factor_positions_m[batch].shape[1]
-        )
-        left_and_right_positions_m = np.concatenate(
+        count = left_factor_positions_m[batch].shape[1]
+        left, right, errors = slice(count), slice(count, 2 * count), slice(2 * count, None)
+        left_and_right_factor_positions_m = np.concatenate(
             [left_factor_positions_m[batch], right_factor_positions_m[batch]], axis=1
         )[:, None]
         gram_matrix = fit_positions(
             replace(positions, delta_position_m=dp, delta_velocity_m_s=dv),
             sigma_a_m_s2,
             variance_m2,
-            left_and_right_positions_m,
+            left_and_right_factor_positions_m,
         ).gram_matrix[:, 0]
-        information = gram_matrix[:, constant_error_rows[:, None], constant_error_rows] + np.diag(
+        information = gram_matrix[:, errors, errors] + np.diag(
             positions.prior_sigmas_of_constant_errors**-2.0
         )
-        constant_error_coefficients = np.linalg.solve(
-            information, gram_matrix[:, constant_error_rows[:, None], right_rows]
+        # Subtract the part that the fitted constant errors explain (Schur complement)
+        products = gram_matrix[:, left, right] - gram_matrix[:, left, errors] @ np.linalg.solve(
+            information, gram_matrix[:, errors, right]
         )
-        products_explained_by_constant_errors = np.einsum(
-            "skc,sck->sk",
-            gram_matrix[:, left_rows[:, None], constant_error_rows],
-            constant_error_coefficients,
-        )
-        inner_products_by_batch.append(
-            gram_matrix[:, left_rows, right_rows] - products_explained_by_constant_errors
-        )
+        inner_products_by_batch.append(np.diagonal(products, axis1=1, axis2=2))
     return np.concatenate(inner_products_by_batch, axis=1)
 
 
@@ -528,19 +476,6 @@ class BandedNormalEquations:
     def state_count(self) -> int:
         """2 (position, velocity), or 3 with time-correlated noise."""
         return len(self.bands) - 2
-
-    def select_rows(self, rows: slice) -> BandedNormalEquations:
-        """Return the equations of the measurements in one or more segments."""
-        state_columns = slice(self.state_count * rows.start, self.state_count * rows.stop)
-        interval_rows = slice(rows.start, rows.stop - 1)
-        return replace(
-            self,
-            precision=self.precision[rows],
-            interval_s=self.interval_s[interval_rows],
-            inverse_q=self.inverse_q[:, interval_rows],
-            bands=self.bands[:, state_columns],
-            cholesky_factor=self.cholesky_factor[:, state_columns],
-        )
 
     def weight_increments(self, delta_position_m: Array, delta_velocity_m_s: Array) -> ArrayPair:
         """Return Q⁻¹ [Δp, Δv] of each interval."""
@@ -585,15 +520,17 @@ class BandedNormalEquations:
 
         ``weighted_dp`` and ``weighted_dv`` are Q⁻¹ [Δp, Δv].
         """
+        # States: position, velocity, and the time-correlated noise if it is fitted
         right_hand_side = np.zeros((*weighted_dp.shape[:-1], len(self.precision), self.state_count))
         right_hand_side[..., 1:, 0] = weighted_dp
         right_hand_side[..., 1:, 1] = weighted_dv
         right_hand_side[..., :-1, 0] -= weighted_dp
         right_hand_side[..., :-1, 1] -= self.interval_s * weighted_dp + weighted_dv
+        # Only the first inputs have positions. A position measures position + time-correlated noise
         weighted_measurements = self.precision[:, 0] * measured_m
-        right_hand_side_of_measured_inputs = right_hand_side[..., : measured_m.shape[-2], :, :]
-        right_hand_side_of_measured_inputs[..., 0] += weighted_measurements
-        right_hand_side_of_measured_inputs[..., 2:] += weighted_measurements[..., None]
+        right_hand_side_with_measurements = right_hand_side[..., : measured_m.shape[-2], :, :]
+        right_hand_side_with_measurements[..., 0] += weighted_measurements
+        right_hand_side_with_measurements[..., 2:] += weighted_measurements[..., None]
         return right_hand_side.reshape(-1, self.state_count * len(self.precision))
 
     def position_variance(self) -> Array:
@@ -603,6 +540,7 @@ class BandedNormalEquations:
         """
         # At each measurement, the Cholesky factor of A contains the information of all earlier
         # measurements. With A in reverse time order, it contains that of all later measurements
+        # Element (i + band, i) of A becomes element (n - 1 - i, n - 1 - i - band)
         time_reversed_bands = np.zeros_like(self.bands)
         number_of_unknowns = self.bands.shape[1]
         for band in range(4):
@@ -619,6 +557,7 @@ class BandedNormalEquations:
         b = self.cholesky_factor[1, 0::2]
         (d, f) = (time_reversed_cholesky_factor[0, first_row::2][::-1] for first_row in (0, 1))
         e = time_reversed_cholesky_factor[1, 0::2][::-1]
+        # Sum of both information matrices LLᵀ, minus the diagonal block of A that is in both
         p00 = a**2 + e**2 + f**2 - self.bands[0, 0::2]
         p01 = a * b + d * e - self.bands[1, 0::2]
         p11 = b**2 + c**2 + d**2 - self.bands[0, 1::2]
@@ -653,8 +592,8 @@ def factorise(
     numpy.linalg.LinAlgError
         A segment has too few measurements for a position and a velocity.
     """
-    q00, q01, q11 = process_noise
     position_measurement_precision = measurement_and_prior_precision[:, 0]
+    q00, q01, q11 = process_noise
     regularisation_variance_m2 = REGULARISATION_TO_POSITION_SIGMA_RATIO**2 * (
         1.0 / np.median(position_measurement_precision[position_measurement_precision > 0.0]) + q00
     )
@@ -678,7 +617,9 @@ def factorise(
     # Elements of Q⁻¹, and the element of FᵀQ⁻¹ in the row of velocity and the column of position
     inverse_q00, inverse_q01, inverse_q11 = inverse_q
     position_velocity_weight = inverse_q00 * interval_s + inverse_q01
-    # A = diag(precision) + Σ [-F I]ᵀ Q⁻¹ [-F I] over the intervals, in LAPACK's band format
+    # A = diag(precision) + Σ [-F I]ᵀ Q⁻¹ [-F I] over the intervals, in LAPACK's band format. Each
+    # state has the element on the diagonal, then the elements below it. The states of the next
+    # measurement begin state_count rows below
     state_count = 2 if correlated_noise is None else 3
     band_storage = np.zeros((len(measurement_and_prior_precision), state_count, state_count + 2))
     position_bands = band_storage[:, 0]

@@ -31,10 +31,10 @@ from px4fuse.flight.model import (
     Unavailable,
     rows_between,
 )
-from px4fuse.trajectory.rotation import interpolate, rotate, to_matrix
+from px4fuse.trajectory.rotation import interpolate, rotate, to_rotation_matrix
 
 # Name of the axis along the main horizontal direction of the flight
-AISLE = "aisle"
+AISLE_AXIS = "aisle"
 # Note of this axis if the user gives its heading
 HEADING_NOTE = "heading chosen with --heading"
 # Minimum length (s) of an IMU gap
@@ -64,7 +64,7 @@ class Segment:
         """Time span of the whole flight."""
         return Segment(*(self.flight_span_s or (self.start_s, self.end_s)), self.reason)
 
-    def cut(self, spans_s: Iterable[Span]) -> tuple[Span, ...]:
+    def clip_spans(self, spans_s: Iterable[Span]) -> tuple[Span, ...]:
         """Cut time spans (s) to the analysed segment, and drop those outside."""
         clipped_spans = ((max(start, self.start_s), min(end, self.end_s)) for start, end in spans_s)
         return tuple((start, end) for start, end in clipped_spans if end > start)
@@ -142,7 +142,7 @@ class Axis:
     @property
     def label(self) -> str:
         """Name of the axis in messages, for example "north" or "the axis of largest motion"."""
-        if self.name != AISLE:
+        if self.name != AISLE_AXIS:
             return self.name
         return f"the axis of {'--heading' if self.note == HEADING_NOTE else 'largest motion'}"
 
@@ -182,7 +182,9 @@ def compute_ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     specific_force_m_s2 = imu[Columns.SPECIFIC_FORCE].to_numpy()
     acceleration = np.empty(specific_force_m_s2.shape)
     for rows in iterate_row_blocks(len(imu)):
-        acceleration[rows] = rotate(to_matrix(attitude_of_samples[rows]), specific_force_m_s2[rows])
+        acceleration[rows] = rotate(
+            to_rotation_matrix(attitude_of_samples[rows]), specific_force_m_s2[rows]
+        )
     acceleration[:, 2] += constants.g
     return pd.DataFrame(acceleration, imu.index, list(AXIS_NAMES), copy=False)
 
@@ -232,7 +234,7 @@ def make_axes(
         An axis has an unknown name, or the heading is not between 0 and 360.
     """
     acceleration = integrate_ned_acceleration(compute_ned_acceleration(flight), segment)
-    valid_names = (*AXIS_NAMES, AISLE)
+    valid_names = (*AXIS_NAMES, AISLE_AXIS)
     axis_names = tuple(dict.fromkeys(valid_names if names is None else names))
     if heading_deg is not None and not 0.0 <= heading_deg <= 360.0:
         raise SettingsError(f"`heading_deg` {heading_deg:g} is not between 0 and 360 degrees.")
@@ -249,8 +251,8 @@ def make_axes(
         if name == "down" and track.barometer is not None:
             track_samples = track.barometer.reindex(columns=Columns.POSITION)
         track_samples = cut_to_segment(track_samples, segment)
-        projected = weighted_sum(track_samples, Columns.POSITION, direction)
-        is_finite = np.isfinite(projected)
+        projected_position_m = weighted_sum(track_samples, Columns.POSITION, direction)
+        is_finite = np.isfinite(projected_position_m)
         if np.count_nonzero(is_finite) < MIN_MEASUREMENTS:
             if names is None:
                 continue
@@ -264,7 +266,7 @@ def make_axes(
                 heading,
                 note,
                 track_samples.index.to_numpy()[is_finite],
-                projected[is_finite],
+                projected_position_m[is_finite],
                 acceleration,
             )
         )
@@ -318,7 +320,7 @@ def weighted_sum(samples: pd.DataFrame, columns: list[str], weights: Array) -> A
 def _choose_axis_direction(
     name: str, track: PositionTrack, segment: Segment, heading_deg: float | None
 ) -> tuple[Array, float | None, str]:
-    if name != AISLE:
+    if name != AISLE_AXIS:
         axis_index = AXIS_NAMES.index(name)
         return np.eye(3)[axis_index], (None if name == "down" else 90.0 * axis_index), ""
     note = HEADING_NOTE
@@ -345,21 +347,19 @@ def integrate_ned_acceleration(
         )
     is_gap = find_imu_gaps(time_s)
     gap_rows = np.flatnonzero(is_gap)
-    gap_sum_s = np.cumsum(np.where(is_gap, np.diff(time_s), 0.0))
+    # The sum of gap times is linear between the edges of the gaps, so these times are sufficient
+    cumulative_gap_s = np.cumsum(np.where(is_gap, np.diff(time_s), 0.0))
     gap_edge_rows = np.unique([0, *gap_rows, *(gap_rows + 1), len(time_s) - 1])
     return Acceleration(
         time_s=time_s,
-        acceleration_integral_m_s=np.array(
-            [
-                integrate_cumulatively(values.to_numpy(), time_s)
-                for _, values in acceleration.items()
-            ]
+        acceleration_integral_m_s=np.ascontiguousarray(
+            integrate_cumulatively(acceleration.to_numpy(), time_s).T
         ),
         acceleration_second_moments_m2_s4=segment_acceleration_m_s2.T
         @ segment_acceleration_m_s2
         / len(segment_acceleration_m_s2),
         gap_edge_time_s=time_s[gap_edge_rows],
-        cumulative_gap_s=np.append(0.0, gap_sum_s)[gap_edge_rows],
+        cumulative_gap_s=np.append(0.0, cumulative_gap_s)[gap_edge_rows],
     )
 
 
@@ -378,12 +378,9 @@ def compute_mean_step_acceleration(
     and the end (s) of each step.
     """
     step_s = np.diff(step_edges_s)
-    velocity_m_s = np.zeros(len(step_edges_s))
-    for component, integral_m_s in zip(
-        direction, acceleration.acceleration_integral_m_s, strict=True
-    ):
-        if component != 0.0:
-            velocity_m_s += component * np.interp(step_edges_s, acceleration.time_s, integral_m_s)
+    velocity_m_s = np.interp(
+        step_edges_s, acceleration.time_s, acceleration.compute_velocity_change_m_s(direction)
+    )
     cumulative_gap_at_edges_s = np.interp(
         step_edges_s, acceleration.gap_edge_time_s, acceleration.cumulative_gap_s
     )

@@ -1,6 +1,7 @@
 """Prediction steps of KF: a step ends at each multiple of DT and at each measurement."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from px4fuse.filter.signals import Axis, compute_mean_step_acceleration
 from px4fuse.flight.model import Unavailable
 
 # Timestamps with a smaller difference (s) are equal: half of PX4's resolution of 1 µs
-MAX_EQUAL_TIME_DIFFERENCE_S = 5e-7
+MAX_DIFFERENCE_OF_EQUAL_TIMES_S = 5e-7
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,10 @@ class PredictionSteps:
         Time of the initial state, then end of each step.
     measurement_index : ndarray of int, shape (n,)
         Index of the measurement at each time, or -1.
+    last_steps : ndarray of int, shape (m,)
+        Index of the time of each measurement. An interval between measurements ends there.
+    interval_index : ndarray of int, shape (n - 1,)
+        Index of the interval that contains each step.
     acceleration_m_s2 : ndarray, shape (n - 1,)
         Mean acceleration over each step.
     imu_gap_variance_m2_s4 : ndarray, shape (n - 1,)
@@ -34,9 +39,15 @@ class PredictionSteps:
 
     time_s: Array
     measurement_index: IntArray
+    last_steps: IntArray
+    interval_index: IntArray
     acceleration_m_s2: Array
     imu_gap_variance_m2_s4: Array
     input_gap_s: float
+
+    def compute_time_to_interval_end_s(self) -> Array:
+        """Return the time (s) from the end of each step to the end of its interval."""
+        return self.time_s[self.last_steps[self.interval_index]] - self.time_s[1:]
 
 
 def make_prediction_steps(axis: Axis, settings: Settings) -> PredictionSteps:
@@ -51,28 +62,30 @@ def make_prediction_steps(axis: Axis, settings: Settings) -> PredictionSteps:
         than the first one.
     """
     start_s = axis.measurement_time_s[0]
-    is_usable = axis.measurement_time_s > start_s + MAX_EQUAL_TIME_DIFFERENCE_S
+    is_usable = axis.measurement_time_s > start_s + MAX_DIFFERENCE_OF_EQUAL_TIMES_S
     measurement_time_s = axis.measurement_time_s[is_usable]
     if not len(measurement_time_s):
         raise SettingsError(
             f"Axis {axis.name} has no position after the initial time of KF, {start_s:.2f} s."
         )
-    grid_count = int(np.floor((measurement_time_s[-1] - start_s) / settings.dt_s + 1e-9)) + 1
-    grid_s = start_s + settings.dt_s * np.arange(grid_count)
+    # A step ends at each multiple of DT and at each measurement
+    grid_point_count = int(np.floor((measurement_time_s[-1] - start_s) / settings.dt_s + 1e-9)) + 1
+    grid_s = start_s + settings.dt_s * np.arange(grid_point_count)
     # Multiples of DT that equal a measurement time are omitted, so that no step has zero length
     next_index = np.searchsorted(measurement_time_s, grid_s)
     neighbour_indices = np.clip([next_index - 1, next_index], 0, len(measurement_time_s) - 1)
     time_to_measurement_s = np.abs(measurement_time_s[neighbour_indices] - grid_s).min(axis=0)
     time_s = np.union1d(
-        grid_s[time_to_measurement_s > MAX_EQUAL_TIME_DIFFERENCE_S], measurement_time_s
+        grid_s[time_to_measurement_s > MAX_DIFFERENCE_OF_EQUAL_TIMES_S], measurement_time_s
     )
-    if time_s[0] > start_s + MAX_EQUAL_TIME_DIFFERENCE_S:
-        time_s = np.append(start_s, time_s)
     measurement_index = np.full(len(time_s), -1, dtype=np.intp)
     measurement_index[np.searchsorted(time_s, measurement_time_s)] = np.flatnonzero(is_usable)
+    last_steps = np.flatnonzero(measurement_index >= 0)
+    interval_index = np.searchsorted(last_steps, np.arange(1, len(time_s)))
+    make_steps = partial(PredictionSteps, time_s, measurement_index, last_steps, interval_index)
     if settings.input == "zero":
         zeros = np.zeros(len(time_s) - 1)
-        return PredictionSteps(time_s, measurement_index, zeros, zeros, 0.0)
+        return make_steps(zeros, zeros, 0.0)
     if isinstance(axis.acceleration, Unavailable):
         raise SettingsError(
             f"The setting `input` is imu, but the axis {axis.name} has no IMU acceleration.",
@@ -84,18 +97,9 @@ def make_prediction_steps(axis: Axis, settings: Settings) -> PredictionSteps:
     gap_s = gap_fraction * np.diff(time_s)
     # Unlike white noise, the unknown acceleration is constant in an IMU gap of T seconds. This
     # increases the velocity variance by the factor T/DT
-    interval_index = np.searchsorted(
-        np.flatnonzero(measurement_index >= 0), np.arange(1, len(time_s))
-    )
     gap_duration_in_interval_s = np.bincount(interval_index, weights=gap_s)[interval_index]
     gap_variance_factor = np.maximum(gap_duration_in_interval_s / settings.dt_s, 1.0)
     imu_gap_variance_m2_s4 = (
         gap_fraction * gap_variance_factor * axis.acceleration.compute_rms_m_s2(axis.direction) ** 2
     )
-    return PredictionSteps(
-        time_s,
-        measurement_index,
-        mean_acceleration_m_s2,
-        imu_gap_variance_m2_s4,
-        float(np.sum(gap_s)),
-    )
+    return make_steps(mean_acceleration_m_s2, imu_gap_variance_m2_s4, float(np.sum(gap_s)))

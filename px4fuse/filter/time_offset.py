@@ -9,14 +9,15 @@ interval (sandwich estimate, White 1982).
 
 from collections.abc import Callable
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array
-from px4fuse.core.record import NOT_IN_JSON, Count, NotInJson, NotNegative, Record, Share, Span
-from px4fuse.filter.fitting import NoiseParameters, fit_constant_errors, maximise_likelihood
+from px4fuse.core.record import NOT_IN_JSON, Count, NonNegativeFloat, NotInJson, Record, Share, Span
+from px4fuse.filter.fitting import NoiseParameters, add_noises
 from px4fuse.filter.imu_motion import (
     COARSE_SEARCH_MEASUREMENT_COUNT,
     HEADING_SIGMA_RAD,
@@ -52,7 +53,7 @@ LIKELIHOOD_CURVE_POINT_COUNT = 121
 # Prior σ (rad) of EKF2's heading with GNSS: a wrong GNSS delay (0.2 s) causes an error of 5°
 GNSS_HEADING_SIGMA_RAD = 0.2
 # Tested differences (s): time offset of one part of the flight minus that of the whole flight
-PART_OFFSET_CHANGES_S = np.concatenate(
+FLIGHT_PART_OFFSET_DIFFERENCES_S = np.concatenate(
     [np.linspace(-0.6, -0.3, 4), np.linspace(-0.2, 0.2, 9), np.linspace(0.3, 0.6, 4)]
 )
 # Maximum half-width (s) of the 95 % interval of an accepted time offset
@@ -74,13 +75,13 @@ MIN_TIME_OFFSET_S = 0.03
 SIMULATED_SEGMENT_GROUP_COUNT, FLIGHT_SEGMENTS_PER_SIMULATED_GROUP = 96, 12
 
 
-class PartOffset(Record):
+class FlightPartTimeOffset(Record):
     """Time offset in one part of the flight."""
 
     start_s: float
     end_s: float
     offset_s: float
-    sigma_s: NotNegative
+    sigma_s: NonNegativeFloat
 
 
 class SourceTimeOffset(Record, kw_only=True):
@@ -108,14 +109,14 @@ class SourceTimeOffset(Record, kw_only=True):
 
     offset_s: float
     interval_s: Span
-    sigma_s: NotNegative
+    sigma_s: NonNegativeFloat
     applied_s: float
     is_determinable: bool
     reason: str = ""
     drift_ppm: float | None = None
-    drift_sigma_ppm: NotNegative | None = None
+    drift_sigma_ppm: NonNegativeFloat | None = None
     change_p_value: Share | None = None
-    parts: tuple[PartOffset, ...]
+    parts: tuple[FlightPartTimeOffset, ...]
     count: Count
     likelihood_curve_offsets_s: NotInJson[Array] = NOT_IN_JSON
     curve_log_likelihood_drops: NotInJson[Array] = NOT_IN_JSON
@@ -191,22 +192,12 @@ def estimate_time_offset(
         return imu_motion
     progress("time offset")
     downsampled_motion = imu_motion.downsample(COARSE_SEARCH_MEASUREMENT_COUNT)
-    offset_s, _ = imu_motion.search_offset(noise_parameters)
-    offset_sigma_s = 0.0
+    offset_s, _ = imu_motion.search_time_offset(noise_parameters)
     search_half_width_s = INITIAL_SEARCH_HALF_WIDTH_S
     for motion in (downsampled_motion, imu_motion):
-        noise_parameters = maximise_likelihood(
-            [motion.make_positions_at_offset(offset_s)],
-            noise_parameters,
-            motion.measurement_weights,
-            fits_outliers=False,
-        ).noise_parameters
+        noise_parameters = motion.fit_noises(offset_s, noise_parameters).noise_parameters
         tested_offsets_s = _make_offset_grid(offset_s, search_half_width_s, FINE_GRID_OFFSET_COUNT)
-        scores = fit_constant_errors(
-            motion.make_position_batches(tested_offsets_s),
-            noise_parameters,
-            motion.measurement_weights,
-        ).compute_scores()[0]
+        scores = motion.fit_at_offsets(tested_offsets_s, noise_parameters).compute_scores()[0]
         offset_s, offset_sigma_s = _fit_minimum_and_sigma(tested_offsets_s, scores)
         likelihood_curve_half_width_s = max(
             LIKELIHOOD_CURVE_HALF_WIDTH_SIGMAS * offset_sigma_s, MIN_LIKELIHOOD_CURVE_HALF_WIDTH_S
@@ -215,30 +206,22 @@ def estimate_time_offset(
     offset_variance_factor = _simulate_variance_increase_by_imu_noise(
         imu_motion, offset_s, noise_parameters, offset_sigma_s**-2.0
     )
-    likelihood_curve_offsets_s, profile_scores, interval_low_s, interval_high_s = (
-        _compute_offset_likelihood_curve(
-            imu_motion,
-            noise_parameters,
-            (tested_offsets_s, scores),
-            offset_s,
-            likelihood_curve_half_width_s,
-            MAX_LOG_LIKELIHOOD_DROP * offset_variance_factor,
-        )
+    curve = _compute_offset_likelihood_curve(
+        imu_motion,
+        noise_parameters,
+        tested_offsets_s,
+        scores,
+        offset_s,
+        likelihood_curve_half_width_s,
+        MAX_LOG_LIKELIHOOD_DROP * offset_variance_factor,
     )
-    has_both_interval_ends = interval_low_s is not None and interval_high_s is not None
-    offset_s = _fit_minimum_and_sigma(likelihood_curve_offsets_s, profile_scores)[0]
+    offset_s = _fit_minimum_and_sigma(curve.offsets_s, curve.scores)[0]
     # IMU samples are averages, so the timing error (half a sample interval, 1 σ) is added
     resolution_s = 0.5 * imu_motion.imu_interval_s
-    interval_limits_s = (
-        likelihood_curve_offsets_s[0] if interval_low_s is None else interval_low_s,
-        likelihood_curve_offsets_s[-1] if interval_high_s is None else interval_high_s,
-    )
-    interval_half_widths_s = np.hypot(np.array(interval_limits_s) - offset_s, 1.96 * resolution_s)
-    interval_low_s = float(offset_s - interval_half_widths_s[0])
-    interval_high_s = float(offset_s + interval_half_widths_s[1])
+    interval_low_s, interval_high_s = curve.widen_interval(offset_s, 1.96 * resolution_s)
     rejection_reason = ""
     if (
-        not has_both_interval_ends
+        None in (curve.low_s, curve.high_s)
         or (interval_high_s - interval_low_s) / 2.0 > MAX_OFFSET_INTERVAL_HALF_WIDTH_S
     ):
         rejection_reason = (
@@ -247,7 +230,7 @@ def estimate_time_offset(
             "positions are noisy"
         )
     applied_offset_s = settings.clock_offset_s
-    parts: tuple[PartOffset, ...] = ()
+    parts: tuple[FlightPartTimeOffset, ...] = ()
     change_p_value = None
     if not rejection_reason:
         progress("change of the position source's time offset during the flight")
@@ -262,8 +245,8 @@ def estimate_time_offset(
         sigma_s=float(np.hypot(offset_sigma_s * np.sqrt(offset_variance_factor), resolution_s)),
         is_determinable=not rejection_reason,
         reason=rejection_reason,
-        likelihood_curve_offsets_s=applied_offset_s + likelihood_curve_offsets_s,
-        curve_log_likelihood_drops=profile_scores - profile_scores.min(),
+        likelihood_curve_offsets_s=applied_offset_s + curve.offsets_s,
+        curve_log_likelihood_drops=curve.scores - curve.scores.min(),
         parts=parts,
         drift_ppm=drift_ppm,
         drift_sigma_ppm=drift_sigma_ppm,
@@ -274,45 +257,58 @@ def estimate_time_offset(
     )
 
 
+class _LikelihoodCurve(NamedTuple):
+    """-ln p (score) of the positions at time offsets, and an interval (s) around the minimum.
+
+    An end of the interval outside the search range is None.
+    """
+
+    offsets_s: Array
+    scores: Array
+    low_s: float | None
+    high_s: float | None
+
+    def widen_interval(self, offset_s: float, additional_half_width_s: float) -> Span:
+        """Return the interval with an additional independent error."""
+        low_s = self.offsets_s[0] if self.low_s is None else self.low_s
+        high_s = self.offsets_s[-1] if self.high_s is None else self.high_s
+        low_half_width_s, high_half_width_s = np.hypot(
+            [low_s - offset_s, high_s - offset_s], additional_half_width_s
+        ).tolist()
+        return offset_s - low_half_width_s, offset_s + high_half_width_s
+
+
 def _compute_offset_likelihood_curve(
     motion: PositionsAndImuMotion,
     noise_parameters: NoiseParameters,
-    tested_offsets_and_scores: tuple[Array, Array],
+    tested_offsets_s: Array,
+    tested_scores: Array,
     offset_s: float,
     half_width_s: float,
     max_score_increase: float,
-) -> tuple[Array, Array, float | None, float | None]:
+) -> _LikelihoodCurve:
     """Compute -ln p of the positions as a function of the time offset.
 
-    Return tested time offsets (s), -ln p of each, and both ends (s) of an interval around the
-    minimum. An end outside the search range is None. ``tested_offsets_and_scores`` contains time
-    offsets for which -ln p is known.
+    ``tested_scores`` contains -ln p of ``tested_offsets_s``. The curve is widened until it contains
+    both ends of the interval.
     """
-    tested_offsets_s, tested_scores = tested_offsets_and_scores
     while True:
-        likelihood_curve_offsets_s = _make_offset_grid(
-            offset_s, half_width_s, LIKELIHOOD_CURVE_POINT_COUNT
-        )
+        offsets_s = _make_offset_grid(offset_s, half_width_s, LIKELIHOOD_CURVE_POINT_COUNT)
+        # Compute -ln p at other time offsets if the known values cannot be interpolated: the curve
+        # is wider, or the steps are too large
         if (
-            likelihood_curve_offsets_s[0] < tested_offsets_s[0]
-            or likelihood_curve_offsets_s[-1] > tested_offsets_s[-1]
+            offsets_s[0] < tested_offsets_s[0]
+            or offsets_s[-1] > tested_offsets_s[-1]
             or tested_offsets_s[1] - tested_offsets_s[0] > MAX_INTERPOLATED_OFFSET_STEP_S
         ):
             tested_offsets_s = _make_offset_grid(offset_s, half_width_s, FINE_GRID_OFFSET_COUNT)
-            tested_scores = fit_constant_errors(
-                motion.make_position_batches(tested_offsets_s),
-                noise_parameters,
-                motion.measurement_weights,
+            tested_scores = motion.fit_at_offsets(
+                tested_offsets_s, noise_parameters
             ).compute_scores()[0]
-        profile_scores = CubicSpline(tested_offsets_s, tested_scores)(likelihood_curve_offsets_s)
-        interval_low_s, interval_high_s = compute_profile_likelihood_interval(
-            likelihood_curve_offsets_s, profile_scores, max_score_increase
-        )
-        if (
-            None not in (interval_low_s, interval_high_s)
-            or half_width_s >= 2.0 * MAX_TESTED_TIME_OFFSET_S
-        ):
-            return likelihood_curve_offsets_s, profile_scores, interval_low_s, interval_high_s
+        scores = CubicSpline(tested_offsets_s, tested_scores)(offsets_s)
+        interval_s = compute_profile_likelihood_interval(offsets_s, scores, max_score_increase)
+        if None not in interval_s or half_width_s >= 2.0 * MAX_TESTED_TIME_OFFSET_S:
+            return _LikelihoodCurve(offsets_s, scores, *interval_s)
         half_width_s *= 2.0
 
 
@@ -334,6 +330,10 @@ def _simulate_variance_increase_by_imu_noise(
 
     Without IMU noise, the variance is 1 / ``fisher_information``. IMU noise is in the residuals and
     in the velocity, so its effect is not negligible.
+
+    Method: the score (derivative of the log-likelihood) is the inner product of residuals and
+    velocity. Simulated residuals and the velocity noise of the same simulation give the additional
+    variance of the score of each group of segments.
     """
     positions_at_offset = imu_motion.make_positions_at_offset(offset_s)
     is_within_segment = positions_at_offset.is_within_segment
@@ -353,6 +353,7 @@ def _simulate_variance_increase_by_imu_noise(
         noise_parameters.sigma_a_m_s2**2
         * positions_at_offset.process_noise_per_sigma_a_squared[:, is_within_segment]
     )
+    # Noise of Δp and Δv with the covariance Q, drawn as Δp and Δv given Δp
     dp, dv = np.zeros((2, axis_count, noise_series_count, measurement_count - 1))
     dp[..., is_within_segment] = np.sqrt(q00) * draw_normal(interval_count_within_segments)
     dv[..., is_within_segment] = np.sqrt(q11 - q01**2 / q00) * draw_normal(
@@ -371,10 +372,8 @@ def _simulate_variance_increase_by_imu_noise(
             * np.sqrt(positions_at_offset.interval_s[is_within_segment])
             * draw_normal(interval_count_within_segments)
         )
-    positions_at_offset, measurement_variance_m2 = positions_at_offset.divide_sigmas_by_sigma_z(
-        1.0,
-        noise_parameters.random_walk_m,
-        imu_motion.measurement_weights / noise_parameters.sigma_z_m**2,
+    positions_at_offset, measurement_variance_m2 = add_noises(
+        positions_at_offset, noise_parameters, imu_motion.measurement_weights
     )
     residual_and_noise_inner_products = compute_segment_inner_products(
         positions_at_offset,
@@ -405,25 +404,23 @@ def _estimate_flight_part_offsets(
     noise_parameters: NoiseParameters,
     offset_variance_factor: float,
     applied_offset_s: float,
-) -> tuple[tuple[PartOffset, ...], float | None]:
+) -> tuple[tuple[FlightPartTimeOffset, ...], float | None]:
     """Estimate the time offset of each flight segment, and test for a constant offset.
 
     ``applied_offset_s`` (s) is added to each offset. Return also the p-value of the test; None with
     fewer than two offsets.
     """
-    coarse_offsets_s = offset_s + PART_OFFSET_CHANGES_S
+    coarse_offsets_s = offset_s + FLIGHT_PART_OFFSET_DIFFERENCES_S
     coarse_offsets_s = coarse_offsets_s[np.abs(coarse_offsets_s) <= MAX_TESTED_TIME_OFFSET_S]
-    segment_scores_at_coarse_offsets = fit_constant_errors(
-        imu_motion.make_position_batches(coarse_offsets_s),
-        noise_parameters,
-        imu_motion.measurement_weights,
+    segment_scores_at_coarse_offsets = imu_motion.fit_at_offsets(
+        coarse_offsets_s, noise_parameters
     ).compute_segment_scores()[0]
     grid_offsets_s = np.linspace(
         coarse_offsets_s[0], coarse_offsets_s[-1], LIKELIHOOD_CURVE_POINT_COUNT
     )
     spline = CubicSpline(coarse_offsets_s, segment_scores_at_coarse_offsets, axis=1)
     part_offsets = []
-    scores_above_minimum = []
+    score_excesses = []
     for (begin, end), scores in zip(
         pairwise(imu_motion.segment_edges), spline(grid_offsets_s), strict=True
     ):
@@ -432,16 +429,20 @@ def _estimate_flight_part_offsets(
         if sigma_s < MAX_SEGMENT_OFFSET_SIGMA_S:
             start_s, end_s = imu_motion.time_s[[begin, end - 1]].tolist()
             part_offsets.append(
-                PartOffset(start_s, end_s, applied_offset_s + part_offset_s, sigma_s)
+                FlightPartTimeOffset(start_s, end_s, applied_offset_s + part_offset_s, sigma_s)
             )
-            scores_above_minimum.append(scores - scores.min())
+            score_excesses.append(scores - scores.min())
     if len(part_offsets) < 2:
         return tuple(part_offsets), None
-    chi_square = 2.0 * float(np.sum(scores_above_minimum, axis=0).min()) / offset_variance_factor
+    # Log-likelihood ratio: one common time offset against separate time offsets. The terms are in
+    # nats without the effect of IMU noise
+    chi_square = 2.0 * float(np.sum(score_excesses, axis=0).min()) / offset_variance_factor
     return tuple(part_offsets), float(chdtrc(len(part_offsets) - 1, chi_square))
 
 
-def _fit_clock_drift(part_offsets: tuple[PartOffset, ...]) -> tuple[float | None, float | None]:
+def _fit_clock_drift(
+    part_offsets: tuple[FlightPartTimeOffset, ...],
+) -> tuple[float | None, float | None]:
     """Return clock drift and its σ (ppm) of the source; None with fewer than three flight parts."""
     if len(part_offsets) < 3:
         return None, None

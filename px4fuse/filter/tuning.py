@@ -14,7 +14,14 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from px4fuse.core.arrays import Array, BoolArray
-from px4fuse.core.record import NOT_IN_JSON, Count, NotInJson, NotNegative, OrUnavailable, Record
+from px4fuse.core.record import (
+    NOT_IN_JSON,
+    Count,
+    NonNegativeFloat,
+    NotInJson,
+    OrUnavailable,
+    Record,
+)
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.fitting import (
     SIGMA_A_SEARCH_RANGE_M_S2,
@@ -37,7 +44,7 @@ from px4fuse.filter.signals import Axis, make_downsampling_slice, report_too_few
 from px4fuse.flight.model import Flight, Unavailable
 
 HORIZONTAL = "horizontal"
-NoiseInterval = tuple[NotNegative, NotNegative | None]
+NoiseInterval = tuple[NonNegativeFloat, NonNegativeFloat | None]
 MIN_MEASUREMENTS = 30
 MAX_OUTLIER_FRACTION = 0.3
 # Initial values in the search for the acceleration noise: KF's SIGMA_A multiplied by these factors
@@ -45,7 +52,7 @@ START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 # Initial value (m/√s) of the random walk of a source that may drift
 START_RANDOM_WALK_M = 0.02
 # Change of ln SIGMA_A between the first two values in the search for KF's SIGMA_A
-SIGMA_A_BRACKET_WIDTH = 0.1
+LOG_SIGMA_A_BRACKET_WIDTH = 0.1
 # Estimates within this factor of an end of the search range are reported as bounds only
 SEARCH_RANGE_END_TOLERANCE_FACTOR = 1.001
 
@@ -91,8 +98,8 @@ class HeldOutCheck(Record):
         Log-likelihood gain (nats) over KF's current settings in the second half.
     """
 
-    sigma_a_m_s2: NotNegative
-    sigma_z_m: NotNegative
+    sigma_a_m_s2: NonNegativeFloat
+    sigma_z_m: NonNegativeFloat
     count: Count
     log_likelihood_gain_per_measurement: float
 
@@ -118,11 +125,11 @@ class AxisTuning(Record, kw_only=True):
         Maximum-likelihood noises, including the random walk of the source.
     """
 
-    sigma_a_m_s2: NotNegative | None = None
+    sigma_a_m_s2: NonNegativeFloat | None = None
     sigma_a_m_s2_interval: NoiseInterval | None = None
-    sigma_a_two_state_m_s2: NotNegative | None = None
+    sigma_a_two_state_m_s2: NonNegativeFloat | None = None
     sigma_a_two_state_m_s2_interval: NoiseInterval | None = None
-    sigma_z_m: NotNegative | None = None
+    sigma_z_m: NonNegativeFloat | None = None
     sigma_z_m_interval: NoiseInterval | None = None
     log_likelihood_gain_per_measurement: float
     before: OrUnavailable[Consistency]
@@ -231,51 +238,21 @@ def tune_axes(
         return report_too_few_measurements(analysis_name, measurement_count, MIN_MEASUREMENTS)
     current_parameters = NoiseParameters(settings.sigma_a_m_s2, settings.sigma_z_m)
     kf_fit = maximise_likelihood(positions_by_axis, current_parameters, np.ones(measurement_count))
-    # The estimate with biases, tilt and time offset needs IMU data
     imu_motion_fit = None
     if flight is not None and settings.input == "imu":
-        measured_m = np.column_stack([axis.measurement_m for axis in axes])
-        # The first measurement is KF's initial state, without a weight in KF's fit: use weight 1
-        measurement_weights = np.concatenate(
-            [np.ones(len(measured_m) - measurement_count), kf_fit.measurement_weights]
+        imu_motion_fit = _fit_with_imu_motion(
+            axes, settings, kf_fit, flight, may_drift, motion_cache
         )
-        imu_motion = compute_imu_motion(
-            flight,
-            axes[0].measurement_time_s,
-            measured_m,
-            directions=np.array([axis.direction for axis in axes]),
-            dt_s=settings.dt_s,
-            measurement_weights=measurement_weights,
-            motion_cache=motion_cache,
-        )
-        if not isinstance(imu_motion, Unavailable):
-            start_parameters = replace(
-                kf_fit.noise_parameters, random_walk_m=START_RANDOM_WALK_M if may_drift else 0.0
-            )
-            # An approximate time offset is sufficient: it hardly changes the noises
-            offset_s, start_parameters = imu_motion.search_offset(
-                start_parameters, START_SIGMA_A_FACTORS, estimates_scale=False
-            )
-            imu_motion_fit = maximise_likelihood(
-                [imu_motion.make_positions_at_offset(offset_s)],
-                start_parameters,
-                imu_motion.measurement_weights,
-            )
     best_fit = kf_fit if imu_motion_fit is None else imu_motion_fit
-    is_outlier = kf_fit.outlier_probability > 0.5
+    outlier_probability = kf_fit.outlier_probability
     if len(measurement_time_before_downsampling_s) > measurement_count:
-        axis_positions_before_downsampling = [
-            convert_to_positions_and_increments(preintegrated_motion)
-            for preintegrated_motion in preintegrated_motions
-        ]
-        is_outlier = (
-            estimate_outlier_probability(
-                axis_positions_before_downsampling,
-                kf_fit,
-                len(measurement_time_before_downsampling_s),
-            )
-            > 0.5
+        # Also classify the measurements that downsampling omitted
+        outlier_probability = estimate_outlier_probability(
+            [*map(convert_to_positions_and_increments, preintegrated_motions)],
+            kf_fit,
+            len(measurement_time_before_downsampling_s),
         )
+    is_outlier = outlier_probability > 0.5
     if np.mean(is_outlier) > MAX_OUTLIER_FRACTION:
         return Unavailable(
             analysis_name,
@@ -285,10 +262,10 @@ def tune_axes(
         )
     sigma_a, sigma_z = _estimate_noises(best_fit)
     final_sigma_z_m = sigma_z.value_or_bound(best_fit.noise_parameters.sigma_z_m)
-    kf_sigma_a = (
-        sigma_a if imu_motion_fit is None else _estimate_kf_sigma_a(kf_fit, final_sigma_z_m)
-    )
-    if imu_motion_fit is None and flight is not None and settings.input == "imu":
+    kf_sigma_a = sigma_a
+    if imu_motion_fit is not None:
+        kf_sigma_a = _estimate_kf_sigma_a(kf_fit, final_sigma_z_m)
+    elif flight is not None and settings.input == "imu":
         # Without estimates of biases and tilt, KF's SIGMA_A is an upper bound of the noise
         sigma_a = NoiseEstimate(None, None, kf_sigma_a.high)
     final_parameters = NoiseParameters(
@@ -312,6 +289,40 @@ def tune_axes(
     )
 
 
+def _fit_with_imu_motion(
+    axes: tuple[Axis, ...],
+    settings: Settings,
+    kf_fit: NoiseFit,
+    flight: Flight,
+    may_drift: bool,
+    motion_cache: MotionCache | None,
+) -> NoiseFit | None:
+    """Fit the noises together with biases, tilt and time offset; None without IMU data."""
+    measured_m = np.column_stack([axis.measurement_m for axis in axes])
+    # The first measurement is KF's initial state, without a weight in KF's fit: use weight 1
+    measurement_weights = np.ones(len(measured_m))
+    measurement_weights[-len(kf_fit.measurement_weights) :] = kf_fit.measurement_weights
+    imu_motion = compute_imu_motion(
+        flight,
+        axes[0].measurement_time_s,
+        measured_m,
+        directions=np.array([axis.direction for axis in axes]),
+        dt_s=settings.dt_s,
+        measurement_weights=measurement_weights,
+        motion_cache=motion_cache,
+    )
+    if isinstance(imu_motion, Unavailable):
+        return None
+    start_parameters = replace(
+        kf_fit.noise_parameters, random_walk_m=START_RANDOM_WALK_M if may_drift else 0.0
+    )
+    # An approximate time offset is sufficient: it hardly changes the noises
+    offset_s, start_parameters = imu_motion.search_time_offset(
+        start_parameters, START_SIGMA_A_FACTORS, estimates_scale=False
+    )
+    return imu_motion.fit_noises(offset_s, start_parameters, fits_outliers=True)
+
+
 def _estimate_noises(fit: NoiseFit) -> tuple[NoiseEstimate, NoiseEstimate]:
     """Return SIGMA_A and SIGMA_Z of a fit with their 95 % intervals."""
     best_parameters = fit.noise_parameters
@@ -321,16 +332,17 @@ def _estimate_noises(fit: NoiseFit) -> tuple[NoiseEstimate, NoiseEstimate]:
         sigma_a, sigma_z = np.exp([tested_log_sigma_a, tested_log_sigma_z]).tolist()
         return fit.score(NoiseParameters(sigma_a, sigma_z, best_parameters.random_walk_m))
 
-    return _make_noise_estimate(
-        score, (log_sigma_a, log_sigma_z), SIGMA_A_SEARCH_RANGE_M_S2
-    ), _make_noise_estimate(
-        lambda tested_log_sigma_z, tested_log_sigma_a: score(
-            tested_log_sigma_a, tested_log_sigma_z
-        ),
+    def score_with_sigma_z_first(tested_log_sigma_z: float, tested_log_sigma_a: float) -> float:
+        return score(tested_log_sigma_a, tested_log_sigma_z)
+
+    sigma_a = _make_noise_estimate(score, (log_sigma_a, log_sigma_z), SIGMA_A_SEARCH_RANGE_M_S2)
+    sigma_z = _make_noise_estimate(
+        score_with_sigma_z_first,
         (log_sigma_z, log_sigma_a),
         SIGMA_Z_SEARCH_RANGE_M,
         fit.variance_factor_of_ln_sigma_z,
     )
+    return sigma_a, sigma_z
 
 
 def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z_m: float) -> NoiseEstimate:
@@ -341,7 +353,7 @@ def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z_m: float) -> NoiseEstimate:
         return fit.score(NoiseParameters(sigma_a_m_s2, sigma_z_m))
 
     start = float(np.log(fit.noise_parameters.sigma_a_m_s2))
-    bracket = (start - SIGMA_A_BRACKET_WIDTH, start)
+    bracket = (start - LOG_SIGMA_A_BRACKET_WIDTH, start)
     best_log_sigma_a = float(minimize_scalar(score, bracket, options={"xtol": 1e-4}).x)
     return _make_noise_estimate(score, (best_log_sigma_a, 0.0), SIGMA_A_SEARCH_RANGE_M_S2)
 
@@ -405,10 +417,10 @@ def _test_noises_on_second_half(
         fit.score(noise_parameters) - first_half_fit.score(noise_parameters)
         for noise_parameters in (current_parameters, first_half_parameters)
     )
-    second_half_count = len(fit.measurement_weights) - first_half_count
+    second_half_measurement_count = len(fit.measurement_weights) - first_half_count
     return HeldOutCheck(
         first_half_parameters.sigma_a_m_s2,
         first_half_parameters.sigma_z_m,
-        second_half_count,
-        (current_score - first_half_noise_score) / second_half_count,
+        second_half_measurement_count,
+        (current_score - first_half_noise_score) / second_half_measurement_count,
     )

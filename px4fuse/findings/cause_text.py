@@ -4,7 +4,7 @@ A re-run of KF or EKF2 with one change of a setting or of the data shows the cau
 the kind of cause, the change, its effect in the re-run, and the recommended action.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import changes, rerun_effects
@@ -34,7 +34,7 @@ from px4fuse.findings.model import (
     format_percent,
     magnetometer_advice,
 )
-from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
 from px4fuse.flight.model import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
@@ -44,17 +44,17 @@ def classify_cause(analysis: Analysis, cause: Rerun | None) -> str:
     if cause is None:
         return UNKNOWN_CAUSE
     aid = find_aid(analysis)
-    kind_by_change = {
+    cause_kind_by_change = {
         rerun_effects.OUTLIERS_KEY: OUTLIER_CAUSE,
         rerun_effects.TIME_OFFSET_KEY: CLOCK_CAUSE,
         aid.delay: CLOCK_CAUSE,
         rerun_effects.ROTATION_KEY: MISALIGNED_FRAME_CAUSE,
         rerun_effects.FORWARD_BIAS_KEY: ACCELEROMETER_CAUSE,
-        changes.SIGMA_Z: MEASUREMENT_NOISE_CAUSE,
+        changes.SIGMA_Z_KEY: MEASUREMENT_NOISE_CAUSE,
         aid.noise: MEASUREMENT_NOISE_CAUSE,
         aid.gate: WRONG_GATE_CAUSE,
     }
-    for name, kind in kind_by_change.items():
+    for name, kind in cause_kind_by_change.items():
         if name in cause.change:
             return kind
     return PROCESS_NOISE_CAUSE
@@ -99,27 +99,28 @@ def describe_part_explained_by_change(cause: Rerun, statistic: Statistic) -> str
 
 
 def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
-    actions = []
+    """Format the actions that a change of a re-run stands for."""
+    return " ".join(_list_actions(analysis, change))
+
+
+def _list_actions(analysis: Analysis, change: Mapping[str, float]) -> Iterator[str]:
     if change.get(rerun_effects.OUTLIERS_KEY):
-        actions.append(find_source_texts(analysis.source).outlier_action)
+        yield find_source_texts(analysis).outlier_action
     if rerun_effects.FORWARD_BIAS_KEY in change:
-        actions.append("Calibrate the accelerometer and the level horizon.")
+        yield "Calibrate the accelerometer and the level horizon."
     if rotation_deg := change.get(rerun_effects.ROTATION_KEY):
-        action = f"Rotate the positions by {rotation_deg:+.0f}° before they are sent."
         # GNSS refers to true north, so a rotation of its positions is a heading error of EKF2
         if analysis.source.origin.is_gnss:
-            action = magnetometer_advice(analysis.flight) or "Check the heading source of EKF2."
-        actions.append(action)
+            yield magnetometer_advice(analysis.flight) or "Check the heading source of EKF2."
+        else:
+            yield f"Rotate the positions by {rotation_deg:+.0f}° before they are sent."
     if rerun_effects.TIME_OFFSET_KEY in change:
-        actions.append(
-            f"{format_timestamp_action(change[rerun_effects.TIME_OFFSET_KEY])} before sending."
-        )
-    if parameters := {name: change[name] for name in change if name in PARAMETERS}:
+        yield f"{format_timestamp_action(change[rerun_effects.TIME_OFFSET_KEY])} before sending."
+    if parameters := {name: change[name] for name in change if name in MODEL_PARAMETERS}:
         parameters = select_changed_settings(parameters, _find_used_settings(analysis))
-        actions.append(f"Set {format_changes(parameters)}.")
+        yield f"Set {format_changes(parameters)}."
     if kf_settings := {name: change[name] for name in changes.KF_NOISE_SETTINGS & change.keys()}:
-        actions.append(format_kf_settings(kf_settings))
-    return " ".join(actions)
+        yield format_kf_settings(kf_settings)
 
 
 def format_sender_action(source: PositionTrack, shift_s: float) -> str:
@@ -174,10 +175,13 @@ def _format_one_change(analysis: Analysis, cause: Rerun, name: str) -> str:
                 if analysis.source.origin.is_gnss
                 else f"positions rotated in yaw by {angle_text}"
             )
-        case changes.SIGMA_A | changes.SIGMA_Z:
+        case changes.SIGMA_A_KEY | changes.SIGMA_Z_KEY:
             unit, label = SETTING_RANGES[name][2:]
             return f"{label} {value:.2g} {unit} instead of {getattr(settings, name):g} {unit}"
     assert not isinstance(analysis.ekf2_model, Unavailable)
-    used_value, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].printed_unit
-    text = f"{name} {value:.3g} {unit} instead of {used_value:.4g} {unit}"
-    return text.replace("  ", " ").rstrip()
+    used_value, unit = (
+        analysis.ekf2_model.inputs.settings[name],
+        MODEL_PARAMETERS[name].printed_unit,
+    )
+    unit_text = f" {unit}" if unit else ""
+    return f"{name} {value:.3g}{unit_text} instead of {used_value:.4g}{unit_text}"

@@ -31,6 +31,7 @@ from px4fuse.findings.model import (
     SOURCE_SENSOR_CAUSE,
     Findings,
     compute_flag_fraction,
+    error_if,
     find_spans_with_value,
     finding,
     format_percent,
@@ -48,9 +49,9 @@ from px4fuse.flight.model import (
 )
 
 # Severity "error" if EKF2 fuses the positions for less than this fraction of the time
-FUSED_FRACTION_FOR_ERROR = 0.5
+MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR = 0.5
 # Warning if EKF2 fuses the positions for less than this fraction of the time
-FUSED_FRACTION_FOR_WARNING = 0.98
+MAX_FUSED_FRACTION_FOR_WARNING = 0.98
 # Minimum mean position interval (s) that may delay the start of fusion: with jitter, some intervals
 # exceed EKF2's limit of 0.2 s
 MIN_INTERVAL_FOR_LATE_START_S = 0.18
@@ -109,16 +110,21 @@ def detect_unfused_positions(analysis: PreparedComparison) -> Findings:
         return
     fusion_flag = ekf2.fusion_flags["horizontal"]
     fused_fraction = compute_flag_fraction(fusion_flag, analysis.segment)
-    if fused_fraction >= FUSED_FRACTION_FOR_ERROR:
+    if fused_fraction >= MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR:
         yield from _detect_slow_restart(analysis, fusion_flag)
-    if source is None or fused_fraction >= FUSED_FRACTION_FOR_WARNING:
+    if source is None or fused_fraction >= MAX_FUSED_FRACTION_FOR_WARNING:
         return
     title = f"EKF2 never fused the {source.positions_text}"
+    if fused_fraction:
+        title = (
+            f"EKF2 fused the {source.positions_text} only {format_percent(fused_fraction)} of "
+            "the time"
+        )
     evidence: dict[str, float | str] = {
         "fused_fraction": fused_fraction,
         "source_interval_s": 1.0 / source.compute_rate_hz(),
     }
-    if source.origin.aid is None:
+    if source.origin.aid is None:  # EKF2 does not read this topic
         if source.name == MOTION_CAPTURE_TOPIC and not fused_fraction:
             yield make_warning(
                 "ekf2_not_fusing",
@@ -139,21 +145,17 @@ def detect_unfused_positions(analysis: PreparedComparison) -> Findings:
     evidence["condition"] = condition
     if not condition and not source.origin.has_all_samples:
         action = f"Record with SDLOG_PROFILE 129 (default and vision). {action}"
-    if fused_fraction:
-        title = (
-            f"EKF2 fused the {source.positions_text} only {format_percent(fused_fraction)} of "
-            "the time"
-        )
     if unmet_condition.fault:
         title += f": {unmet_condition.fault}"
     message = f"{title}. {unmet_condition.reason}"
-    if fused_fraction >= FUSED_FRACTION_FOR_ERROR:
+    if fused_fraction >= MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR:
         message += (
             f" For up to {longest_span_s[1] - longest_span_s[0]:.1f} s EKF2 relied on the IMU and "
             "other aiding sources."
         )
         yield make_warning("ekf2_fusion_interrupted", message, action, evidence, spans)
         return
+    # The user may have switched off GNSS, the usual source, on purpose
     is_disabled_gnss = source.origin.is_fused_as_gnss and condition == "switch"
     yield finding(
         "note" if is_disabled_gnss else "error",
@@ -180,7 +182,7 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
     if is_valid is None or is_valid.empty:
         return
     invalid_fraction = 1.0 - compute_flag_fraction(is_valid, analysis.segment)
-    if invalid_fraction <= 1.0 - FUSED_FRACTION_FOR_WARNING:
+    if invalid_fraction <= 1.0 - MAX_FUSED_FRACTION_FOR_WARNING:
         return
     spans = find_spans_with_value(0.0, is_valid, analysis.segment)
     distance_m = _find_largest_distance_m(analysis, ekf2, spans)
@@ -193,7 +195,7 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
             f" The invalid position is up to {format_metres(distance_m)} m from the {reference}."
         )
     yield finding(
-        "error" if invalid_fraction > 1.0 - FUSED_FRACTION_FOR_ERROR else "warning",
+        error_if(invalid_fraction > 1.0 - MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR),
         "ekf2_position_invalid",
         f"EKF2's horizontal position is invalid {format_percent(invalid_fraction)} of the time "
         f"(xy_valid 0), and PX4 does not use this position.{distance_sentence}",
@@ -222,6 +224,7 @@ def _detect_slow_restart(analysis: PreparedComparison, fusion_flag: pd.Series) -
     if (
         "EKF2_EV_CTRL" not in analysis.flight.log.parameters  # PX4 before v1.14
         or not source.origin.is_vision
+        # Only the log shows all positions as EKF2 received them
         or not source.origin.has_all_samples
         or source.alignment
         or 1.0 / rate_hz < MIN_INTERVAL_FOR_LATE_START_S
@@ -235,7 +238,9 @@ def _detect_slow_restart(analysis: PreparedComparison, fusion_flag: pd.Series) -
         last_gap_end_s = gap_ends_s[gap_ends_s < end_s].max(initial=-np.inf)
         unfused_times_s = time_s[(time_s >= last_gap_end_s) & (time_s < end_s)]
         if (
+            # The pause of fusion begins with this gap, not with an earlier one
             last_gap_end_s > start_s - EV_STOP_INTERVAL_S
+            # With one or two positions, EKF2 resumed fusion at once
             and len(unfused_times_s) > 2
             and unfused_times_s[1] - unfused_times_s[0] >= EV_START_INTERVAL_S
         ):
@@ -297,6 +302,7 @@ def detect_aid_faults(
     ``kf_position_aid`` is the aiding source that also gives KF's positions. ``height_error_m`` is
     EKF2's height error in a barometer gap.
     """
+    # One finding for all aiding sources of a sensor: the same parameter enables their fusion
     aids_to_test = {name: aid for name, aid in aids.items() if name not in AIDS_TESTED_BY_REPLAY}
     unfused_aids_by_switch: dict[str, list[AidResult]] = {}
     for name, aid in aids_to_test.items():
@@ -310,6 +316,8 @@ def detect_aid_faults(
         yield _make_not_fused_finding(
             fusion_parameter, aids_of_sensor, kf_position_aid, height_error_m
         )
+    # Overconfidence of the sensor that KF uses is reported for its positions. A change of the mean
+    # innovation also makes the NIS and the mean innovation of the flight wrong: test it first
     for name, aid in aids_to_test.items():
         sensor_cause = _find_shared_sensor_cause(AIDS[name].switch, kf_position_aid)
         if not sensor_cause and any(result.change for result in aid.axes.values()):
@@ -416,9 +424,12 @@ def _find_large_height_error_m(analysis: Analysis, span_s: Span) -> float | None
     if isinstance(errors, Unavailable):
         return None
     error_m = errors["error_m"].abs()
-    is_in_span = (error_m.index >= span_s[0]) & (error_m.index <= span_s[1])
-    largest_error_m = float(error_m[is_in_span].max())
-    is_large = largest_error_m > MIN_GAP_ERROR_TO_HEIGHT_RMSE_RATIO * rms(error_m[~is_in_span])
+    error_in_span_m = error_m.loc[slice(*span_s)]
+    largest_error_m, other_errors_m = (
+        float(error_in_span_m.max()),
+        error_m.drop(error_in_span_m.index),
+    )
+    is_large = largest_error_m > MIN_GAP_ERROR_TO_HEIGHT_RMSE_RATIO * rms(other_errors_m)
     return largest_error_m if is_large else None
 
 
@@ -431,8 +442,6 @@ def _find_shared_sensor_cause(fusion_parameter: str, kf_position_aid: str) -> st
 
     Both are from one sensor if the same EKF2 parameter enables their fusion. Otherwise, return "".
     """
-    return (
-        SOURCE_SENSOR_CAUSE
-        if kf_position_aid and AIDS[kf_position_aid].switch == fusion_parameter
-        else ""
-    )
+    if kf_position_aid and AIDS[kf_position_aid].switch == fusion_parameter:
+        return SOURCE_SENSOR_CAUSE
+    return ""

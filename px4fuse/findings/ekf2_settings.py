@@ -29,6 +29,7 @@ from px4fuse.findings.model import (
     CAUSE_KEY,
     REPORTED_VARIANCE_USED_BY_EKF2_CAUSE,
     Findings,
+    error_if,
     find_source_texts,
     finding,
     format_percent,
@@ -36,18 +37,18 @@ from px4fuse.findings.model import (
     make_warning,
     make_zero_length_spans,
 )
-from px4fuse.flight.ekf2_parameters import AID_MASK_PARAMETER, PARAMETERS
+from px4fuse.flight.ekf2_parameters import AID_MASK_PARAMETER, MODEL_PARAMETERS
 from px4fuse.flight.model import Ekf2, Unavailable
 
 # Severity "error" if EKF2's noise parameter is at least this factor too small or too large
-MIN_NOISE_FACTOR_FOR_ERROR = 2.0
+MIN_NOISE_FACTOR_FOR_SEVERITY_ERROR = 2.0
 # Minimum fraction of rejected positions that the finding on a too small noise of EKF2 states
 MIN_REJECTED_FRACTION_IN_MESSAGE = 0.05
 # Minimum fraction of rejected positions for a warning: with a gate of 5 √S, a consistent filter
 # rejects a fraction of 6e-7
 REJECTED_FRACTION_FOR_WARNING = 0.01
 # Minimum fraction of rejected positions for severity "error"
-REJECTED_FRACTION_FOR_ERROR = 0.20
+MIN_REJECTED_FRACTION_FOR_SEVERITY_ERROR = 0.20
 # A re-run with a changed setting prevents rejections if it reduces the rejected fraction to less
 # than this multiple of the fraction without the change
 MAX_REJECTED_AFTER_TO_BEFORE_RATIO = 0.5
@@ -68,33 +69,34 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
     if rerun is None:
         return
     assert not isinstance(analysis.ekf2_model, Unavailable)
-    inputs = analysis.ekf2_model.inputs
-    used_noise_m, estimated_noise_m = find_used_noise_m(inputs), rerun.change[aid.noise]
+    inputs, parameter = analysis.ekf2_model.inputs, aid.noise
+    used_noise_m, estimated_noise_m = find_used_noise_m(inputs), rerun.change[parameter]
     # EKF2 uses the larger of reported σ and noise parameter
-    noise_setting_m = inputs.settings[aid.noise]
+    noise_setting_m = inputs.settings[parameter]
     uses_reported_sigma = used_noise_m > noise_setting_m
     ratio = estimated_noise_m / used_noise_m
-    factor, size_word, reason = ratio, "small", "EKF2's gain is too large."
-    if ratio < 1.0:
-        factor, size_word, reason = 1.0 / ratio, "large", "EKF2's gain is too small."
+    is_too_small = ratio >= 1.0
+    factor, size_word = (ratio, "small") if is_too_small else (1.0 / ratio, "large")
     sensor_name = analysis.source.kind_name
-    effect_text = ""
+    name = "EKF2's assumed measurement noise" if uses_reported_sigma else parameter
+    # PX4's default suits usual sensors: if it is too small, this sensor is noisier
+    is_default_noise = used_noise_m == analysis.flight.log.find_default_value(parameter)
+    if is_too_small and is_default_noise:
+        title = f"{sensor_name} noise is {format_factor(factor)} times the noise setting of EKF2"
+    else:
+        title = f"{name} is {format_factor(factor)} times too {size_word}"
     rejected_fraction = analysis.main.rejected_fraction or 0.0
     if rejected_fraction >= MIN_REJECTED_FRACTION_IN_MESSAGE:
-        effect_text = f": EKF2 rejects {format_percent(rejected_fraction)} of the positions"
+        title += f": EKF2 rejects {format_percent(rejected_fraction)} of the positions"
         reason = f"EKF2 rejects normal {sensor_name} noise as outliers."
-    name = "EKF2's assumed measurement noise" if uses_reported_sigma else aid.noise
-    title = f"{name} is {format_factor(factor)} times too {size_word}"
-    is_default_noise = used_noise_m == analysis.flight.log.find_default_value(aid.noise)
-    # PX4's default suits usual sensors: if it is too small, this sensor is noisier
-    if ratio > 1.0 and is_default_noise:
-        title = f"{sensor_name} noise is {format_factor(factor)} times the noise setting of EKF2"
+    else:
+        reason = f"EKF2's gain is too {'large' if is_too_small else 'small'}."
     interval_text, horizontal_tuning = "", analysis.tuning.get(HORIZONTAL)
     if isinstance(horizontal_tuning, AxisTuning):
         low_m, high_m = horizontal_tuning.sigma_z.low, horizontal_tuning.sigma_z.high
         interval_text = f" (95 % {low_m:.3g} to {high_m:.3g} m)" if low_m and high_m else ""
     message = (
-        f"{title}{effect_text}. {name} is {used_noise_m:.3g} m; the maximum-likelihood estimate is "
+        f"{title}. {name} is {used_noise_m:.3g} m; the maximum-likelihood estimate is "
         f"{estimated_noise_m:.3g} m{interval_text}. {reason}"
     )
     action = f"Set {format_changes(select_changed_settings(rerun.change, inputs.settings))}."
@@ -102,15 +104,11 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
         mode_text = f" ({aid.noise_mode_parameter} 0)" if aid.noise_mode_parameter else ""
         message += (
             f" EKF2 uses the σ that {sensor_name} reports{mode_text}, because this σ is larger "
-            f"than {aid.noise} ({noise_setting_m:g} m)."
+            f"than {parameter} ({noise_setting_m:g} m)."
         )
         action += f" Or let the position source report a variance of {estimated_noise_m**2:.2g} m²."
-    if analysis.source.origin.is_gnss and math.isclose(
-        analysis.settings.sigma_z_m, used_noise_m, rel_tol=1e-2
-    ):
-        message += f" KF takes SIGMA_Z from {aid.noise}."
     yield finding(
-        "error" if factor >= MIN_NOISE_FACTOR_FOR_ERROR else "warning",
+        error_if(factor >= MIN_NOISE_FACTOR_FOR_SEVERITY_ERROR),
         f"ekf2_noise_too_{size_word}",
         message,
         action + make_height_noise_advice(analysis, analysis.tuning, estimated_noise_m),
@@ -168,7 +166,7 @@ def _find_rejections(analysis: Analysis, gate: float) -> Findings:
         if rejected_fraction >= REJECTED_FRACTION_FOR_WARNING:
             quantity = "heights" if result is down_comparison else "positions"
             yield finding(
-                "error" if rejected_fraction >= REJECTED_FRACTION_FOR_ERROR else "warning",
+                error_if(rejected_fraction >= MIN_REJECTED_FRACTION_FOR_SEVERITY_ERROR),
                 "ekf2_rejects_positions",
                 f"EKF2 rejects {format_percent(rejected_fraction)} of the {quantity}. The "
                 f"rejected innovations are outside EKF2's gate of {gate:g} √S.",
@@ -190,7 +188,7 @@ def _find_rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
     if helpful_reruns and result is analysis.main:
         return format_action(analysis, min(helpful_reruns, key=compute_preference_key).change)
     return (
-        f"{find_source_texts(analysis.source).data_link_check}. Then check {aid.delay} and "
+        f"{find_source_texts(analysis).data_link_check}. Then check {aid.delay} and "
         f"{aid.noise}. Increase {aid.gate} only if no fault is found."
     )
 
@@ -215,17 +213,27 @@ def detect_parameter_changes(analysis: Analysis) -> Findings:
     changes = [
         change
         for change in ekf2.parameter_changes
-        if change.name in (*PARAMETERS, *fusion_parameters)
+        if change.name in (*MODEL_PARAMETERS, *fusion_parameters)
         and segment.start_s < change.time_s < segment.end_s
     ]
     edges_s = [segment.start_s, *(change.time_s for change in changes), segment.end_s]
     spans = [_assess_span(analysis, *span_s) for span_s in pairwise(edges_s)]
+    # Each change is compared with the spans before and after it
     for (time_s, name, value_before, value_after), (before, after) in zip(
         changes, pairwise(spans), strict=True
     ):
         (nis_before, rmse_before_m), (nis_after, rmse_after_m) = before, after
-        unit = "" if name in fusion_parameters else f" {PARAMETERS[name].printed_unit}".rstrip()
-        effect_sentences, has_effect = "", name in fusion_parameters
+        action = (
+            f"Analyse the flight before (--end {time_s:.1f}) and after the parameter change "
+            f"(--start {time_s:.1f}) separately."
+        )
+        if name in fusion_parameters:  # always has an effect: it switches sensors
+            has_effect, unit_text = True, ""
+            action = f"Do not change {name} in flight. {action}"
+        else:
+            unit = MODEL_PARAMETERS[name].printed_unit
+            has_effect, unit_text = False, f" {unit}" if unit else ""
+        effect_sentences = ""
         if not isinstance(nis_before, Unavailable) and not isinstance(nis_after, Unavailable):
             has_effect |= nis_before.verdict != nis_after.verdict
             has_effect |= _differ_by_min_factor(nis_before.sigma_ratio, nis_after.sigma_ratio)
@@ -241,15 +249,9 @@ def detect_parameter_changes(analysis: Analysis) -> Findings:
                 f"{format_metres(rmse_before_m)} m "
                 f"before and {format_metres(rmse_after_m)} m after the change."
             )
-        action = (
-            f"Analyse the flight before (--end {time_s:.1f}) and after the parameter change "
-            f"(--start {time_s:.1f}) separately."
-        )
-        if name in fusion_parameters:
-            action = f"Do not change {name} in flight. {action}"
         yield (make_warning if has_effect else make_note)(
             "parameter_changed",
-            f"{name} changed from {value_before:g} to {value_after:g}{unit} at {time_s:.1f} "
+            f"{name} changed from {value_before:g} to {value_after:g}{unit_text} at {time_s:.1f} "
             f"s.{effect_sentences}",
             action,
             {"parameter": name, "before": value_before, "after": value_after, "at_s": time_s},
@@ -282,7 +284,7 @@ def _assess_span(
     innovations = analysis.main.ekf2_tracks.innovations
     if isinstance(innovations, Unavailable):
         return innovations, rmse_m
-    samples = innovations[(innovations.index >= start_s) & (innovations.index < end_s)]
+    samples = innovations.loc[start_s:end_s]
     consistency = Consistency.from_innovations(
         samples["innovation_m"].to_numpy(), samples["innovation_variance_m2"].to_numpy(), math.inf
     )

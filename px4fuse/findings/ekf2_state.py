@@ -26,7 +26,7 @@ from px4fuse.findings.model import (
     make_warning,
     make_zero_length_spans,
 )
-from px4fuse.flight.ekf2_parameters import BAROMETER, MAG
+from px4fuse.flight.ekf2_parameters import MAG
 from px4fuse.flight.model import (
     BODY_AXES,
     Columns,
@@ -52,9 +52,9 @@ REST_WINDOW_S = 1.0
 # Time (s) before take-off in which the motors run
 MOTOR_RUN_UP_DURATION_S = 0.5
 # Maximum standard deviation of angular rate (rad/s) and specific force (m/s²) at rest
-MAX_RATE_STD_AT_REST, MAX_FORCE_STD_AT_REST = 0.04, 1.5
+MAX_ANGULAR_RATE_STD_AT_REST_RAD_S, MAX_SPECIFIC_FORCE_STD_AT_REST_M_S2 = 0.04, 1.5
 # Maximum change (rad/s) of the mean angular rate between windows at rest
-MAX_RATE_CHANGE_AT_REST_RAD_S = 0.01
+MAX_ANGULAR_RATE_CHANGE_AT_REST_RAD_S = 0.01
 # Minimum gyroscope bias (rad/s) for a finding: the heading turns by 90° in 30 s
 MIN_GYRO_BIAS_RAD_S = 0.05
 # Minimum |specific force at rest - gravity| (m/s²): above it, the finding on a bias at its limit
@@ -96,11 +96,15 @@ def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
     imu = rows_between(flight.imu, -np.inf, end_s).astype(np.float64)
     windows = imu.groupby(np.floor(imu.index / REST_WINDOW_S))
     stds = windows.std()
-    is_rate_constant = np.linalg.norm(stds[Columns.ANGULAR_RATE], axis=1) < MAX_RATE_STD_AT_REST
-    is_force_constant = np.linalg.norm(stds[Columns.SPECIFIC_FORCE], axis=1) < MAX_FORCE_STD_AT_REST
+    is_rate_constant = (
+        np.linalg.norm(stds[Columns.ANGULAR_RATE], axis=1) < MAX_ANGULAR_RATE_STD_AT_REST_RAD_S
+    )
+    is_force_constant = (
+        np.linalg.norm(stds[Columns.SPECIFIC_FORCE], axis=1) < MAX_SPECIFIC_FORCE_STD_AT_REST_M_S2
+    )
     means: pd.DataFrame = windows.mean()[is_rate_constant & is_force_constant]
     rates_rad_s = means[Columns.ANGULAR_RATE]
-    if means.empty or np.ptp(rates_rad_s, axis=0).max() > MAX_RATE_CHANGE_AT_REST_RAD_S:
+    if means.empty or np.ptp(rates_rad_s, axis=0).max() > MAX_ANGULAR_RATE_CHANGE_AT_REST_RAD_S:
         return None
     return means.median()
 
@@ -129,27 +133,19 @@ def _detect_bias_at_limit(
                     f"instead of {constants.g:.2f} (bias {constants.g - force_m_s2:+.2f} m/s² "
                     "down)."
                 )
+        if axis_index == 2 and (down_comparison := analysis.axes.get("down")) is not None:
+            truth = down_comparison.filters["ekf2"].truth
+            if isinstance(truth, ErrorsAgainstTruth):
+                message += (
+                    " EKF2's height RMSE against ground truth is "
+                    f"{format_metres(truth.position_rmse_m)} m."
+                )
         yield make_error(
             "ekf2_bias_at_limit",
-            message + (_describe_height_error(analysis, ekf2) if axis_index == 2 else ""),
+            message,
             f"Calibrate the {sensor}s at the temperature of the flight.",
             {"bias": median_bias, "limit": limit, "limited_fraction": time_at_limit_fraction},
         )
-
-
-def _describe_height_error(analysis: Analysis, ekf2: Ekf2) -> str:
-    error_text, down_comparison = "", analysis.axes.get("down")
-    truth = None if down_comparison is None else down_comparison.filters["ekf2"].truth
-    if isinstance(truth, ErrorsAgainstTruth):
-        error_text = (
-            f" EKF2's height RMSE against ground truth is {format_metres(truth.position_rmse_m)} m."
-        )
-    if (barometer_log := ekf2.aids.get(BAROMETER.name)) is not None:
-        innovations = cut_to_segment(barometer_log.samples, analysis.segment)[
-            f"innovation_{barometer_log.axes[0]}"
-        ]
-        error_text += f" Barometer innovations have a mean of {abs(innovations.mean()):.1f} m."
-    return error_text
 
 
 def _detect_gyro_bias(bias_states: pd.DataFrame, median_imu_at_rest: pd.Series | None) -> Findings:
@@ -194,6 +190,8 @@ def detect_missing_alignment(
     if not fuses_source_yaw:
         heading_action = _find_heading_action(flight, source)
         quantities.append(("yaw_align", "heading", heading_action))
+    # EKF2 aligns the heading after the tilt, so the time until tilt alignment is not the fault of
+    # the heading
     alignment_end_s = segment.start_s
     for flag, quantity, action in quantities:
         if flag not in ekf2.status_flags:
@@ -236,7 +234,8 @@ def _find_heading_action(flight: Flight, source: PositionTrack | None) -> str:
 def detect_resets(analysis: Analysis, ekf2: Ekf2) -> Findings:
     """Detect resets of EKF2's position and height, except normal ones at take-off."""
     segment = analysis.segment.whole_flight
-    # Resets up to the start of fusion are normal
+    # Resets up to the start of fusion are normal. If the log shows that EKF2 never fused positions,
+    # this time is NaN, and every reset counts
     fusion_start_s = -math.inf
     if isinstance(ekf2.fusion_flags, pd.DataFrame):
         is_fused = ekf2.fusion_flags["horizontal"] > 0.0
@@ -253,6 +252,7 @@ def detect_resets(analysis: Analysis, ekf2: Ekf2) -> Findings:
     if position_resets:
         horizontal_resets = [reset for reset in position_resets if any(reset.delta[:2])]
         resets = horizontal_resets or position_resets
+        # True if each reset follows a gap in the positions
         follows_gap = all(
             any(
                 start <= reset.time_s <= end + MAX_RESET_DELAY_S

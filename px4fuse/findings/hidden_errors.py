@@ -19,7 +19,7 @@ from px4fuse.comparison.model import (
 )
 from px4fuse.comparison.rerun_effects import Rerun, find_cause_rerun
 from px4fuse.comparison.reruns import ErrorAboveSigma, find_error_above_sigma
-from px4fuse.core.text import capitalise_first, format_metres, format_ratio
+from px4fuse.core.text import capitalise_first_letter, format_metres, format_ratio
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
@@ -28,6 +28,7 @@ from px4fuse.findings.loops import find_usable_loop
 from px4fuse.findings.model import (
     CAUSE_KEY,
     Findings,
+    error_if,
     find_source_texts,
     finding,
     format_percent,
@@ -38,13 +39,13 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.alignment import fit_alignment
 
 # Minimum mean NEES, for severity "error": an RMS position error of 4 times the reported σ
-MIN_NEES_FOR_ERROR = 16.0
+MIN_NEES_FOR_SEVERITY_ERROR = 16.0
 # If KF's position RMSE ÷ EKF2's position RMSE is below this ratio, the fault is in EKF2 and not in
 # the positions, which both filters use
 MAX_KF_TO_EKF2_RMSE_RATIO = 0.7
 # The position frame is misaligned if alignment (shift and rotation) reduces the position RMSE to
 # less than this fraction
-MAX_ALIGNED_RMSE_RATIO = 0.5
+MAX_ALIGNED_TO_UNALIGNED_RMSE_RATIO = 0.5
 DRIFT_REMEDY = "In the next flight, send an absolute position (GNSS, UWB) as well."
 LOOP_REMEDY = "To correct the path of this flight by a loop closure, run px4fuse loop LOG."
 FRAME_REMEDY = "Rotate and shift the positions into the frame of the ground truth."
@@ -89,12 +90,14 @@ def detect(analysis: Analysis) -> Findings:
 def make_hidden_error_finding(
     analysis: Analysis, errors_not_in_innovations: list[tuple[FilterName, str, ErrorAboveSigma]]
 ) -> Finding:
+    # The main axis first; then the first, largest error of each filter counts
     errors_not_in_innovations = sorted(
         errors_not_in_innovations, key=lambda entry: entry[1] != analysis.main.axis.name
     )
     worst_filter, worst_axis, worst_error = errors_not_in_innovations[0]
-    # Keep the first error of each filter
-    error_by_filter = {entry[0]: entry[1:] for entry in reversed(errors_not_in_innovations)}
+    error_by_filter = dict[FilterName, tuple[str, ErrorAboveSigma]]()
+    for filter_name, axis, error in errors_not_in_innovations:
+        error_by_filter.setdefault(filter_name, (axis, error))
     evidence: dict[str, float | str] = {"axis": worst_axis, "filter": worst_filter}
     ratio_texts, sentences = dict[str, str](), list[str]()
     rerun_by_filter = dict[FilterName, Rerun]()
@@ -118,12 +121,12 @@ def make_hidden_error_finding(
             f"{analysis.axes[axis].axis.label}, reported σ "
             f"{format_metres(error.reported_sigma_m)} m."
         )
+    # The cause of the worst error or, without it, that of the other filter's error
     cause = rerun_by_filter.get(worst_filter) or next(iter(rerun_by_filter.values()), None)
     evidence[CAUSE_KEY] = classify_cause(analysis, cause)
-    alignment_rmse = None if rerun_by_filter else _compute_alignment_rmse(analysis, worst_filter)
-    rmse_text = f"position RMSE {format_metres(worst_error.rmse_m)} m against ground truth"
     is_misaligned = False
-    if alignment_rmse is not None:
+    rmse_text = f"position RMSE {format_metres(worst_error.rmse_m)} m against ground truth"
+    if cause is None and (alignment_rmse := _compute_alignment_rmse(analysis, worst_filter)):
         before_m, after_m = alignment_rmse
         rmse_text = (
             f"horizontal position RMSE {format_metres(before_m)} m before and "
@@ -133,16 +136,15 @@ def make_hidden_error_finding(
             "position_rmse_horizontal_m": before_m,
             "position_rmse_aligned_m": after_m,
         }
-        is_misaligned = after_m < MAX_ALIGNED_RMSE_RATIO * before_m
-        if is_misaligned:
-            sentences.append(f"The position frame is misaligned: {rmse_text}.")
-    if analysis.source.origin.may_drift and not rerun_by_filter and not is_misaligned:
-        return _make_drift_finding(analysis, rmse_text, evidence, tuple(ratio_texts))
+        is_misaligned = after_m < MAX_ALIGNED_TO_UNALIGNED_RMSE_RATIO * before_m
     kf_errors = analysis.axes[worst_axis].filters["kf"].truth
     if cause is not None:
         remedy = format_action(analysis, cause.change)
     elif is_misaligned:
+        sentences.append(f"The position frame is misaligned: {rmse_text}.")
         remedy = FRAME_REMEDY
+    elif analysis.source.origin.may_drift:
+        return _make_drift_finding(analysis, rmse_text, evidence, tuple(ratio_texts))
     elif (
         error_by_filter.keys() == {"ekf2"}
         and isinstance(kf_errors, ErrorsAgainstTruth)
@@ -156,9 +158,9 @@ def make_hidden_error_finding(
                 "A time offset of the positions is possible, but this log cannot show it: "
                 f"{analysis.time_offset.reason}. {analysis.time_offset.remedy}"
             )
-        remedy += f" {find_source_texts(analysis.source).slow_error_check}."
+        remedy += f" {find_source_texts(analysis).slow_error_check}."
     return finding(
-        "error" if worst_error.nees >= MIN_NEES_FOR_ERROR else "warning",
+        error_if(worst_error.nees >= MIN_NEES_FOR_SEVERITY_ERROR),
         "error_exceeds_reported_sigma",
         f"Position errors that innovations do not show: {', '.join(ratio_texts.values())}. "
         f"{' '.join(sentences)}",
@@ -178,6 +180,7 @@ def _make_drift_finding(
     ``filter_labels`` are the filters whose position error exceeds their reported σ.
     """
     loop, drift_text, rmse_sentence = find_usable_loop(analysis), rmse_text, ""
+    # State the closure error first if it shows the drift: true end known, path from odometry
     if (
         loop is not None
         and not (loop.is_end_assumed or loop.is_absolute_track)
@@ -186,7 +189,7 @@ def _make_drift_finding(
     ):
         length_m = loop.path_length_m
         evidence = {**evidence, "closure_error_m": closure_error_m, "path_length_m": length_m}
-        rmse_sentence = f"{capitalise_first(rmse_text)}. "
+        rmse_sentence = f"{capitalise_first_letter(rmse_text)}. "
         drift_text = (
             f"loop closure error {format_metres(closure_error_m)} m, "
             f"{format_percent(closure_error_m / length_m, 1)} of a path of {length_m:.0f} m"

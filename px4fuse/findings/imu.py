@@ -9,15 +9,22 @@ from px4fuse.core.arrays import select_intervals
 from px4fuse.core.record import Span
 from px4fuse.ekf2.inputs import MAX_MISSING_IMU_FRACTION, compute_lost_imu_fraction
 from px4fuse.filter.hypotheses import (
-    MIN_BIAS_M_S2,
+    MIN_REPORTED_ACCELEROMETER_BIAS_M_S2,
     SystematicErrors,
     estimate_mean_acceleration_error,
 )
 from px4fuse.filter.signals import Segment, cut_to_segment, find_imu_gaps
 from px4fuse.finding import MIN_SPAN_S
-from px4fuse.findings.model import Findings, finding, format_percent, make_error, make_warning
+from px4fuse.findings.model import (
+    Findings,
+    error_if,
+    finding,
+    format_percent,
+    make_error,
+    make_warning,
+)
 from px4fuse.findings.recording import DEFAULT_SDLOG_PROFILE, VISION_PROFILE_MASK
-from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, sample_rate
+from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, compute_sample_rate_hz
 
 # Maximum specific force (m/s²) of real sensors: 35 g, because the largest range is 32 g
 MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2 = 343.0
@@ -63,15 +70,16 @@ def detect_impossible_acceleration(analysis: Analysis) -> Findings:
     times_s = samples.index[force_m_s2 > MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2].tolist()
     if len(times_s) < MIN_IMPLAUSIBLE_FORCE_SAMPLES:
         return
-    max_force_m_s2, start_s = float(np.nanmax(force_m_s2)), times_s[0]
+    max_specific_force_m_s2, start_s = float(np.nanmax(force_m_s2)), times_s[0]
     yield make_error(
         "imu_values_impossible",
-        f"The accelerometer values are impossible: up to {max_force_m_s2:,.0f} m/s², first at "
+        f"The accelerometer values are impossible: up to {max_specific_force_m_s2:,.0f} m/s², "
+        "first at "
         f"{start_s:.1f} s. Sensors of autopilots measure at most 32 g (314 m/s²). The simulator "
         "has diverged, or the log is damaged.",
         "Analyse only the time before the impossible values "
         f"(--end {max(start_s - 1.0, 0.0):.1f}).",
-        {"max_m_s2": max_force_m_s2, "count": len(times_s), "at_s": start_s},
+        {"max_m_s2": max_specific_force_m_s2, "count": len(times_s), "at_s": start_s},
         ((start_s, times_s[-1]),),
     )
 
@@ -99,18 +107,17 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
             )
         sensor_text = "accelerometers and the level horizon"
     elif ekf2_bias_m_s2 is not None:
-        # The first branch reports a significant horizontal bias that is estimated from the
-        # positions. Here, this estimate is not significant or missing. If it is not significant,
-        # test only EKF2's estimate of the vertical bias
-        is_horizontal_bias_estimated = isinstance(systematic_errors, SystematicErrors)
-        bias_m_s2 = float(np.linalg.norm(ekf2_bias_m_s2[2 * is_horizontal_bias_estimated :]))
-        forward, right, down = ekf2_bias_m_s2
+        forward, right, down = tested_bias_m_s2 = ekf2_bias_m_s2
+        # The positions show no significant horizontal bias: test only the vertical bias
+        if isinstance(systematic_errors, SystematicErrors):
+            tested_bias_m_s2 = [down]
+        bias_m_s2 = float(np.linalg.norm(tested_bias_m_s2))
         message = (
             f"EKF2 estimates an accelerometer bias of {bias_m_s2:.2f} m/s²: {forward:+.2f} "
             f"forward, {right:+.2f} right and {down:+.2f} down."
         )
         min_severe_bias_m_s2 = np.inf  # a bias that EKF2 estimates does not affect EKF2
-    else:
+    else:  # test the vertical bias with the heights of the source
         error_m_s2 = 0.0
         if (result := analysis.axes.get("down")) is not None:
             error_m_s2 = estimate_mean_acceleration_error(result.axis) or 0.0
@@ -120,9 +127,9 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
             "the heights of the position source. An accelerometer scale factor of "
             f"{1.0 - error_m_s2 / constants.g:.3f} has the same effect."
         )
-    if bias_m_s2 >= MIN_BIAS_M_S2:
+    if bias_m_s2 >= MIN_REPORTED_ACCELEROMETER_BIAS_M_S2:
         yield finding(
-            "error" if bias_m_s2 >= min_severe_bias_m_s2 else "warning",
+            error_if(bias_m_s2 >= min_severe_bias_m_s2),
             "accelerometer_bias",
             f"{message} KF does not estimate biases.",
             f"Calibrate the {sensor_text} at the temperature of the flight.",
@@ -141,7 +148,7 @@ def _find_ekf2_accelerometer_bias(analysis: Analysis) -> list[float] | None:
 
 def detect_tumbling(analysis: Analysis) -> Findings:
     """Detect roll or pitch beyond the limits of PX4's failure detector."""
-    if spans := analysis.segment.cut(analysis.flight.excessive_tilt_spans_s):
+    if spans := analysis.segment.clip_spans(analysis.flight.excessive_tilt_spans_s):
         start_s = spans[0][0]
         yield make_error(
             "attitude_failure",
@@ -160,7 +167,7 @@ def detect_clipping(analysis: Analysis) -> Findings:
         return
     imu_samples = cut_to_segment(imu, analysis.segment)
     time_s = imu_samples.index[imu_samples["clipped"] > 0.0].to_numpy()
-    clipped_duration_s = len(time_s) / sample_rate(imu)
+    clipped_duration_s = len(time_s) / compute_sample_rate_hz(imu)
     if clipped_duration_s > MAX_CLIPPING_DURATION_S:
         bursts_s = np.split(
             time_s, np.flatnonzero(np.diff(time_s) > MIN_TIME_BETWEEN_CLIPPINGS_S) + 1
@@ -180,7 +187,10 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
     gap_s, imu, log = analysis.main.kf_run.input_gap_s, analysis.flight.imu, analysis.flight.log
     interval_s, spans = 0.0, tuple[Span, ...]()
     if not isinstance(imu, Unavailable):
-        interval_s, spans = 1.0 / sample_rate(imu), _find_gap_spans(imu, analysis.segment)
+        interval_s, spans = (
+            1.0 / compute_sample_rate_hz(imu),
+            _find_gap_spans(imu, analysis.segment),
+        )
     if gap_s > max(MIN_REPORTED_IMU_GAP_S, 2.0 * interval_s):
         action = ""
         if log.format.startswith("MAVLink"):
@@ -233,7 +243,7 @@ def _find_gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
 
 
 def is_rate_too_low(samples: pd.DataFrame, required_rate_hz: float) -> bool:
-    return sample_rate(samples) < MIN_MEASURED_TO_REQUIRED_RATE_RATIO * required_rate_hz
+    return compute_sample_rate_hz(samples) < MIN_MEASURED_TO_REQUIRED_RATE_RATIO * required_rate_hz
 
 
 def detect_low_rates(flight: Flight) -> Findings:
@@ -245,7 +255,7 @@ def detect_low_rates(flight: Flight) -> Findings:
     ):
         topic = flight.streams[name].topics[0] if name in flight.streams else default_topic
         if isinstance(samples, pd.DataFrame) and is_rate_too_low(samples, required_rate_hz):
-            rate_hz = sample_rate(samples)
+            rate_hz = compute_sample_rate_hz(samples)
             sdlog_profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_SDLOG_PROFILE))
             action = (
                 f"Set SDLOG_PROFILE to {sdlog_profile | SDLOG_HIGH_RATE_MASK} (bit 4 logs {topic} "

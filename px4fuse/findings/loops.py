@@ -3,7 +3,7 @@
 from px4fuse.analysis import Analysis
 from px4fuse.finding import Finding
 from px4fuse.findings.model import Findings, make_error, make_note, make_warning
-from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
+from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Loop, LoopClosure
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
 # Maximum fraction of rejected loop closures if the stated odometry drift is correct
@@ -32,7 +32,25 @@ def find_usable_loop(analysis: Analysis) -> Loop | None:
 def detect_loop_faults(loop: Loop) -> Findings:
     """Detect false loop closures and wrong assumptions about a loop."""
     yield from detect_inconsistent_closures(loop)
-    yield from detect_wrong_loop_assumptions(loop)
+    closure_error_m = loop.closure_error_m
+    evidence = {} if closure_error_m is None else {"closure_error_m": closure_error_m}
+    if loop.is_absolute_track:
+        yield make_warning(
+            "loop_on_absolute_positions",
+            "This track consists of absolute positions, which do not drift. The closure error is "
+            "position noise, so a correction makes the path worse.",
+            "Loop closures need odometry: send visual-inertial odometry to PX4 as ODOMETRY.",
+            evidence,
+        )
+    if evidence and loop.is_end_assumed:
+        yield make_note(
+            "loop_landing_assumed",
+            "The landing place is unknown, so px4fuse assumes the take-off place. The loop closure "
+            "error contains the distance between both places.",
+            "Measure the landing place. Run px4fuse loop --landed-at FORWARD,RIGHT (m, forward and "
+            "right of the vehicle at take-off).",
+            evidence,
+        )
 
 
 def detect_inconsistent_closures(loop: Loop) -> Findings:
@@ -61,29 +79,7 @@ def detect_inconsistent_closures(loop: Loop) -> Findings:
             )
 
 
-def detect_wrong_loop_assumptions(loop: Loop) -> Findings:
-    closure_error_m = loop.closure_error_m
-    evidence = {} if closure_error_m is None else {"closure_error_m": closure_error_m}
-    if loop.is_absolute_track:
-        yield make_warning(
-            "loop_on_absolute_positions",
-            "This track consists of absolute positions, which do not drift. The closure error is "
-            "position noise, so a correction makes the path worse.",
-            "Loop closures need odometry: send visual-inertial odometry to PX4 as ODOMETRY.",
-            evidence,
-        )
-    if evidence and loop.is_end_assumed:
-        yield make_note(
-            "loop_landing_assumed",
-            "The landing place is unknown, so px4fuse assumes the take-off place. The loop closure "
-            "error contains the distance between both places.",
-            "Measure the landing place. Run px4fuse loop --landed-at FORWARD,RIGHT (m, forward and "
-            "right of the vehicle at take-off).",
-            evidence,
-        )
-
-
-def _make_false_closure_finding(closure: Closure, is_end_assumed: bool) -> Finding:
+def _make_false_closure_finding(closure: LoopClosure, is_end_assumed: bool) -> Finding:
     is_landing = closure.source == LANDING_CLOSURE_SOURCE
     closure_text = str(closure)
     if is_landing and is_end_assumed:
@@ -104,5 +100,5 @@ def _make_false_closure_finding(closure: Closure, is_end_assumed: bool) -> Findi
     )
 
 
-def _make_closure_evidence(closure: Closure) -> dict[str, float]:
+def _make_closure_evidence(closure: LoopClosure) -> dict[str, float]:
     return {**{name: getattr(closure, name) for name in CLOSURE_FIELDS}, "alpha": GATE_ALPHA}

@@ -10,12 +10,13 @@ import numpy as np
 import pandas as pd
 from msgspec.structs import replace
 
+from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.record import Record, Span, read_toml
-from px4fuse.core.text import capitalise_first
+from px4fuse.core.text import capitalise_first_letter
 from px4fuse.filter.signals import Segment
 from px4fuse.finding import SEVERITIES, Finding, Severity
 from px4fuse.flight.ekf2_parameters import MAG, MAG_TYPE_NONE
-from px4fuse.flight.model import Flight, PositionKind, PositionTrack
+from px4fuse.flight.model import Flight, PositionKind
 
 
 class CatalogueEntry(Record):
@@ -108,7 +109,7 @@ class FindingExample(Record):
     detection_rate_by_fault: Mapping[str, float]
 
 
-def load_examples() -> Mapping[str, FindingExample]:
+def load_finding_examples() -> Mapping[str, FindingExample]:
     return msgspec.json.decode(
         Path(__file__).with_name("examples.json").read_bytes(), type=dict[str, FindingExample]
     )
@@ -133,9 +134,9 @@ class SourceTexts(Record):
 SOURCE_TEXTS = read_toml(__file__, dict[PositionKind, SourceTexts], "source_words.toml")
 
 
-def find_source_texts(source: PositionTrack) -> SourceTexts:
-    """Return the texts about causes and actions for a position source, such as UWB."""
-    return SOURCE_TEXTS[source.origin.kind]
+def find_source_texts(comparison: PreparedComparison) -> SourceTexts:
+    """Return the texts about causes and actions for the kind of position source, such as UWB."""
+    return SOURCE_TEXTS[comparison.source.origin.kind]
 
 
 def magnetometer_advice(flight: Flight) -> str:
@@ -157,9 +158,13 @@ def finding(
     spans_s: tuple[Span, ...] = (),
 ) -> Finding:
     """Make a finding with the id ``name``; its title is the first sentence of the message."""
-    message = capitalise_first(message)
+    message = capitalise_first_letter(message)
     title = message.partition(". ")[0].removesuffix(".")
     return Finding(name, severity, message, remedy, evidence, title, spans_s=spans_s)
+
+
+def error_if(is_severe: bool) -> Severity:
+    return "error" if is_severe else "warning"
 
 
 make_error, make_warning, make_note = (partial(finding, severity) for severity in SEVERITIES)
@@ -184,15 +189,18 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         if (
             cause_group is None
             or (cause_group[0].severity == "note" and cause in CAUSES_ONLY_ABOVE_SEVERITY_NOTE)
+            # White noise above the assumed noise can also cause these effects
             or WHITE_TO_ASSUMED_NOISE_RATIO_KEY in cause_group[0].evidence
         ):
             continue
         effects, severity = effects_text.splitlines(), cause_group[0].severity
         for group in [group for group in groups if group is not cause_group]:
-            effect = group[0]
+            effect, *effects_of_effect = group
             if effect.id in effects or f"{effect.id}: {effect.evidence.get(CAUSE_KEY)}" in effects:
+                # The finding and its effects move to the group of the cause
                 groups.remove(group)
-                cause_group += [replace(effect, caused_by=cause), *group[1:]]
+                cause_group += [replace(effect, caused_by=cause), *effects_of_effect]
+                # A cause is as severe as its effects, except the effects on KF
                 if effect.id not in _KF_FINDINGS:
                     severity = min(severity, effect.severity, key=SEVERITIES.index)
         cause_group[0] = replace(cause_group[0], severity=severity)
@@ -257,7 +265,7 @@ def find_spans_with_value(
     edges_s[0] = -np.inf
     has_value = np.pad(step_function == value, 1)
     change_times_s = edges_s[has_value[1:] != has_value[:-1]].tolist()
-    return segment.cut(zip(change_times_s[::2], change_times_s[1::2], strict=True))
+    return segment.clip_spans(zip(change_times_s[::2], change_times_s[1::2], strict=True))
 
 
 def compute_flag_fraction(step_function: pd.Series, segment: Segment) -> float:

@@ -3,13 +3,14 @@
 SIGMA_A and SIGMA_Z are estimated together, because the mean NIS does not distinguish them.
 """
 
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.changes import MIN_RERUN_SIGMA_Z_M, SIGMA_A, SIGMA_Z, find_axis_tuning
+from px4fuse.comparison.changes import SIGMA_A_KEY, SIGMA_Z_KEY, find_axis_tuning
 from px4fuse.comparison.estimates import find_first_available_tuning
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
@@ -40,31 +41,32 @@ from px4fuse.findings.model import (
     MEASUREMENT_NOISE_CAUSE,
     UNKNOWN_CAUSE,
     Findings,
+    error_if,
     finding,
     lower_severity,
     make_error,
 )
 from px4fuse.findings.source_positions import has_little_motion
-from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, PARAMETERS
-from px4fuse.flight.model import Columns, Unavailable, sample_rate
+from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, MODEL_PARAMETERS
+from px4fuse.flight.model import Columns, Unavailable, compute_sample_rate_hz
 from px4fuse.readers.px4_innovations import has_fused_aid
 from px4fuse.request import COMPARISON_OPTIONS
 
 # Warning if a noise setting is at least this factor too small or too large
-MIN_SETTING_TO_ESTIMATE_FACTOR = 1.5
+MIN_NOISE_SETTING_TO_ESTIMATE_FACTOR = 1.5
 # Severity "error" if a noise setting is at least this factor too small or too large
-MIN_NOISE_FACTOR_FOR_ERROR = 4.0
+MIN_NOISE_FACTOR_FOR_SEVERITY_ERROR = 4.0
 # KF hardly reacts to new positions if its time constant exceeds this value (s)
 MIN_KF_TIME_CONSTANT_S = 2.5
 # Factor that widens the 95 % interval of ln(noise): only 0.3 % of correct noise settings are
 # outside
-INTERVAL_WIDENING_FACTOR = 1.5
+CONFIDENCE_INTERVAL_WIDENING_FACTOR = 1.5
 # KF lags if the lag-1 autocorrelation of its innovations exceeds this value (white noise: at most
 # 0.2)
-MIN_LAG1_AUTOCORRELATION = 0.3
+MIN_INNOVATION_LAG1_AUTOCORRELATION = 0.3
 
 # Severity "error" if the reported σ is at least this factor too small or too large
-MIN_SIGMA_FACTOR_FOR_ERROR = 2.0
+MIN_SIGMA_FACTOR_FOR_SEVERITY_ERROR = 2.0
 # Maximum ratio (larger ÷ smaller) of two noises that count as equal: a σ estimated from the median
 # of 100 values has a standard error of 12 %
 MAX_RATIO_OF_EQUAL_NOISES = 1.25
@@ -114,12 +116,13 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
     axis_tuning = find_first_available_tuning(analysis.tuning, HORIZONTAL, "aisle", "down")
     if axis_tuning is None:
         return
-    noise_estimates = {SIGMA_Z: axis_tuning.sigma_z, SIGMA_A: axis_tuning.sigma_a_two_state}
+    noise_estimates = {SIGMA_Z_KEY: axis_tuning.sigma_z, SIGMA_A_KEY: axis_tuning.sigma_a_two_state}
     if has_little_motion(analysis):  # without motion SIGMA_A cannot be estimated
-        del noise_estimates[SIGMA_A]
+        del noise_estimates[SIGMA_A_KEY]
     may_drift = analysis.source.origin.may_drift
-    # Innovations do not show drift, so a setting above the estimate may be correct
-    may_be_larger = (
+    # Innovations do not show drift and time-correlated errors, so a setting above the estimate may
+    # be correct
+    may_setting_exceed_estimate = (
         may_drift
         or analysis.source.origin.is_gnss
         or any(filter_name == "kf" for filter_name, *_ in find_hidden_errors(analysis))
@@ -128,14 +131,16 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
     for name, noise in noise_estimates.items():
         setting = getattr(analysis.settings, name)
         deviation = find_setting_deviation(name, setting, noise)
-        if deviation is None or (
-            may_be_larger
-            and (setting >= deviation.estimate or (may_drift and deviation.severity == "note"))
-        ):
+        if deviation is None:
             continue
-        setting_finding = _make_setting_finding(analysis, axis_tuning, name, deviation)
+        if may_setting_exceed_estimate and setting >= deviation.estimate:
+            continue
+        if may_drift and deviation.severity == "note":
+            continue
+        setting_finding = _make_setting_finding(analysis, axis_tuning, name, noise, deviation)
         rank = SEVERITIES.index(setting_finding.severity), -deviation.factor
         findings.append((rank, setting_finding))
+    # SIGMA_Z and SIGMA_A are estimated together: the more severe finding is the cause of the other
     cause = None
     for _, setting_finding in sorted(findings, key=lambda item: item[0]):
         yield structs.replace(setting_finding, caused_by=cause)
@@ -143,24 +148,29 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
 
 
 def _make_setting_finding(
-    analysis: Analysis, axis_tuning: AxisTuning, name: str, deviation: SettingDeviation
+    analysis: Analysis,
+    axis_tuning: AxisTuning,
+    name: str,
+    noise: NoiseEstimate,
+    deviation: SettingDeviation,
 ) -> Finding:
     estimated_noise, factor, severity = deviation
-    setting = getattr(analysis.settings, name)
-    noise = axis_tuning.sigma_z if name == SIGMA_Z else axis_tuning.sigma_a_two_state
-    label, size_word = SETTING_RANGES[name].label, "small" if setting < estimated_noise else "large"
-    effect, gain_size_word = "KF follows the positions slowly", "small"
-    if (name == SIGMA_Z) == (size_word == "small"):
+    setting, label = getattr(analysis.settings, name), SETTING_RANGES[name].label
+    is_too_small = setting < estimated_noise
+    # R = SIGMA_Z² decreases KF's gain, Q from SIGMA_A increases the gain
+    is_gain_too_large = is_too_small if name == SIGMA_Z_KEY else not is_too_small
+    if is_gain_too_large:
         effect, gain_size_word = "KF follows the noise of single positions", "large"
-    action, note = format_setting_action(analysis, name), ""
-    if name == SIGMA_Z and estimated_noise < MIN_RERUN_SIGMA_Z_M:
-        note = f" Re-runs use a SIGMA_Z of at least {MIN_RERUN_SIGMA_Z_M:g} m."
+    else:
+        effect, gain_size_word = "KF follows the positions slowly", "small"
+    size_word = "small" if is_too_small else "large"
+    action = format_setting_action(analysis, name)
     return finding(
         "note" if action == NO_IMPROVEMENT_ACTION else severity,
         f"{label.lower()}_too_{size_word}",
         f"{label} is {'at least ' if noise.value is None else ''}{format_factor(factor)} "
         f"times too {size_word}: {effect}. {format_estimate(name, setting, noise)}. KF's gain is "
-        f"too {gain_size_word}.{note}",
+        f"too {gain_size_word}.",
         action,
         {
             "chosen": setting,
@@ -193,7 +203,7 @@ def format_setting_action(analysis: Analysis, name: str) -> str:
         return f"To test the default value, run again without {COMPARISON_OPTIONS[name]}."
     # SIGMA_A and SIGMA_Z are estimated together: setting only one of them to its estimate can make
     # a consistent KF inconsistent
-    other_label = "SIGMA_A" if name == SIGMA_Z else "SIGMA_Z"
+    other_label = "SIGMA_A" if name == SIGMA_Z_KEY else "SIGMA_Z"
     return (
         f"Do not change this setting alone: it is estimated together with {other_label}, and no "
         "re-run confirmed the estimate."
@@ -204,16 +214,20 @@ def find_setting_deviation(
     name: str, setting: float, noise_estimate: NoiseEstimate
 ) -> SettingDeviation | None:
     """Return the deviation of a noise setting from its estimate, if it is significant."""
-    if not (estimate := noise_estimate.value or noise_estimate.high):
+    low, estimate, high = noise_estimate.low, noise_estimate.value, noise_estimate.high
+    if estimate is None:  # only an upper bound is known
+        low, estimate = 0.0, high
+    if not estimate:
         return None
-    low, high = 0.0, estimate
-    if noise_estimate.value is not None:
-        low, high = noise_estimate.low or 0.0, noise_estimate.high or np.inf
-    low, high = (estimate * (end / estimate) ** INTERVAL_WIDENING_FACTOR for end in (low, high))
+    # Widen the 95 % interval on the logarithmic scale
+    low, high = (
+        estimate * (end / estimate) ** CONFIDENCE_INTERVAL_WIDENING_FACTOR
+        for end in (low or 0.0, high or np.inf)
+    )
     factor = max(setting / estimate, estimate / setting)
-    if low <= setting <= high or factor < MIN_SETTING_TO_ESTIMATE_FACTOR:
+    if low <= setting <= high or factor < MIN_NOISE_SETTING_TO_ESTIMATE_FACTOR:
         return None
-    severity: Severity = "error" if factor >= MIN_NOISE_FACTOR_FOR_ERROR else "warning"
+    severity = error_if(factor >= MIN_NOISE_FACTOR_FOR_SEVERITY_ERROR)
     if setting == getattr(Settings(), name):  # px4fuse's default, not chosen by the user
         severity = lower_severity(severity)
     return SettingDeviation(estimate, factor, severity)
@@ -228,11 +242,11 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
         if (
             isinstance(summary, Unavailable)
             or summary.verdict != "overconfident"
-            or summary.lag1_autocorrelation < MIN_LAG1_AUTOCORRELATION
+            or summary.lag1_autocorrelation < MIN_INNOVATION_LAG1_AUTOCORRELATION
         ):
             continue
         gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
-        time_constant_s = 1.0 / (sample_rate(updates) * gain)
+        time_constant_s = 1.0 / (compute_sample_rate_hz(updates) * gain)
         if time_constant_s < MIN_KF_TIME_CONSTANT_S:
             continue
         sigma_a_m_s2 = analysis.settings.sigma_a_m_s2
@@ -241,8 +255,8 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
         action = "Increase SIGMA_A (--sigma-a)."
         if axis_tuning is not None and (estimate := axis_tuning.sigma_a_two_state).value:
             title = f"SIGMA_A is {format_factor(estimate.value / sigma_a_m_s2)} times too small"
-            estimate_text = f"{format_estimate(SIGMA_A, sigma_a_m_s2, estimate)}. "
-            action = format_setting_action(analysis, SIGMA_A)
+            estimate_text = f"{format_estimate(SIGMA_A_KEY, sigma_a_m_s2, estimate)}. "
+            action = format_setting_action(analysis, SIGMA_A_KEY)
         yield make_error(
             "process_noise_near_zero",
             f"{title}: KF ignores new positions. {estimate_text}KF's position gain decreases to "
@@ -254,23 +268,20 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
 
 
 def detect_inconsistent_variances(analysis: Analysis) -> Findings:
-    for filter_name in FILTER_NAMES:
-        for is_underconfident in (True, False):
-            first_finding_id = None
-            for axes in AXIS_GROUPS:
-                inconsistent_axes = [
-                    (analysis.axes[name], summary)
-                    for name in axes
-                    if name in analysis.axes
-                    and is_inconsistent(summary := analysis.axes[name].filters[filter_name])
-                    and (summary.sigma_ratio < 1.0) == is_underconfident
-                ]
-                if inconsistent_axes:
-                    sigma_finding = _make_wrong_sigma_finding(
-                        analysis, filter_name, inconsistent_axes
-                    )
-                    yield structs.replace(sigma_finding, caused_by=first_finding_id)
-                    first_finding_id = sigma_finding.id
+    for filter_name, is_underconfident in product(FILTER_NAMES, (True, False)):
+        horizontal_finding_id = None  # cause of the finding on the vertical axis
+        for axes in AXIS_GROUPS:
+            inconsistent_axes = [
+                (analysis.axes[name], summary)
+                for name in axes
+                if name in analysis.axes
+                and is_inconsistent(summary := analysis.axes[name].filters[filter_name])
+                and (summary.sigma_ratio < 1.0) == is_underconfident
+            ]
+            if inconsistent_axes:
+                sigma_finding = _make_wrong_sigma_finding(analysis, filter_name, inconsistent_axes)
+                yield structs.replace(sigma_finding, caused_by=horizontal_finding_id)
+                horizontal_finding_id = sigma_finding.id
 
 
 def _make_wrong_sigma_finding(
@@ -282,51 +293,17 @@ def _make_wrong_sigma_finding(
         inconsistent_axes,
         key=lambda axis: (axis[0] is analysis.main, abs(np.log(axis[1].nis_mean))),
     )
-    is_underconfident, sigma_error_factor = summary.sigma_ratio < 1.0, summary.sigma_error_factor
-    severity: Severity = "error" if sigma_error_factor >= MIN_SIGMA_FACTOR_FOR_ERROR else "warning"
+    severity = error_if(summary.sigma_error_factor >= MIN_SIGMA_FACTOR_FOR_SEVERITY_ERROR)
     if _has_default_noises(analysis, filter_name, worst_axis):
         severity = lower_severity(severity)
-    verdict = "underconfident" if is_underconfident else "overconfident"
-    # A filter with too small innovations may have slow errors, which only ground truth shows
-    may_have_hidden_error = is_underconfident and not summary.is_underconfident_against_truth
-    if may_have_hidden_error and analysis.source.origin.may_drift:
-        severity, remedy_text, cause = "note", KEEP_NOISE_BECAUSE_OF_DRIFT_ACTION, UNKNOWN_CAUSE
-    elif may_have_hidden_error and analysis.source.origin.is_gnss:
-        is_barometer = analysis.source.aid(worst_axis.axis.name) == BAROMETER
-        remedy_text, cause = "", MEASUREMENT_NOISE_CAUSE
-        if filter_name == "ekf2" and not is_barometer:
-            remedy_text = _format_action_for_excessive_noise(analysis)
-        if not remedy_text:
-            severity, cause = "note", UNKNOWN_CAUSE
-            remedy_text = KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(
-                sensor="a barometer" if is_barometer else "GNSS"
-            )
-    elif (
-        is_underconfident
-        and filter_name == "ekf2"
-        and (minimum_text := _format_noise_minimum(analysis))
-    ):
-        severity, remedy_text, cause = "note", minimum_text, UNKNOWN_CAUSE
-    elif is_underconfident and any(
-        filter_with_error == filter_name for filter_with_error, *_ in find_hidden_errors(analysis)
-    ):
-        remedy_text, cause = KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION, UNKNOWN_CAUSE
-    else:
-        rerun = find_cause_rerun(analysis.reruns, filter_name, worst_axis.axis.name)
-        cause = classify_cause(analysis, rerun)
-        remedy_text = _find_action_for_wrong_sigma(analysis, filter_name, worst_axis, rerun)
-        is_kf_noise_of_receiver = (
-            filter_name != "ekf2" and is_underconfident and analysis.source.origin.is_gnss
-        )
-        if remedy_text == KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION or is_kf_noise_of_receiver:
-            severity = "note"
+    cause, remedy_text, is_note = _explain_wrong_sigma(analysis, filter_name, worst_axis, summary)
     low, high = summary.nis_band
+    size_word = "large" if summary.sigma_ratio < 1.0 else "small"
     return finding(
-        severity,
-        f"{filter_name}_{verdict}",
-        f"{FILTER_NAMES[filter_name]} is {verdict} along {worst_axis.axis.label}: σ is "
-        f"{format_ratio(sigma_error_factor)} times too "
-        f"{'large' if is_underconfident else 'small'}. The mean NIS is "
+        "note" if is_note else severity,
+        f"{filter_name}_{summary.verdict}",
+        f"{FILTER_NAMES[filter_name]} is {summary.verdict} along {worst_axis.axis.label}: σ is "
+        f"{format_ratio(summary.sigma_error_factor)} times too {size_word}. The mean NIS is "
         f"{format_number(summary.nis_mean)}, expected {low:.2f} to {high:.2f}.",
         remedy_text,
         {
@@ -336,6 +313,43 @@ def _make_wrong_sigma_finding(
             "fraction_outside_gate": summary.fraction_outside_gate,
             CAUSE_KEY: cause,
         },
+    )
+
+
+def _explain_wrong_sigma(
+    analysis: Analysis, filter_name: FilterName, result: AxisComparison, summary: FilterSummary
+) -> tuple[str, str, bool]:
+    """Return cause and remedy of a wrong σ, and True if it is no fault (severity note)."""
+    source = analysis.source
+    is_underconfident = summary.sigma_ratio < 1.0
+    # A filter with too small innovations may have slow errors, which only ground truth shows
+    if is_underconfident and not summary.is_underconfident_against_truth:
+        if source.origin.may_drift:
+            return UNKNOWN_CAUSE, KEEP_NOISE_BECAUSE_OF_DRIFT_ACTION, True
+        if source.origin.is_gnss:
+            is_barometer = source.aid(result.axis.name) == BAROMETER
+            if (
+                filter_name == "ekf2"
+                and not is_barometer
+                and (remedy_text := _format_action_for_excessive_noise(analysis))
+            ):
+                return MEASUREMENT_NOISE_CAUSE, remedy_text, False
+            remedy_text = KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(
+                sensor="a barometer" if is_barometer else "GNSS"
+            )
+            return UNKNOWN_CAUSE, remedy_text, True
+    if is_underconfident:
+        if filter_name == "ekf2" and (remedy_text := _explain_noise_minimum(analysis)):
+            return UNKNOWN_CAUSE, remedy_text, True
+        if any(name == filter_name for name, *_ in find_hidden_errors(analysis)):
+            return UNKNOWN_CAUSE, KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION, False
+    rerun = find_cause_rerun(analysis.reruns, filter_name, result.axis.name)
+    remedy_text = _find_action_for_wrong_sigma(analysis, filter_name, result, rerun)
+    is_kf_noise_of_receiver = filter_name != "ekf2" and is_underconfident and source.origin.is_gnss
+    return (
+        classify_cause(analysis, rerun),
+        remedy_text,
+        is_kf_noise_of_receiver or remedy_text == KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION,
     )
 
 
@@ -365,27 +379,29 @@ def _format_action_for_excessive_noise(analysis: Analysis) -> str:
     )
 
 
-def _format_noise_minimum(analysis: Analysis) -> str:
-    parameters = analysis.flight.log.parameters
-    gnss_noise_m = parameters.get(GNSS_POS.noise, PARAMETERS[GNSS_POS.noise].default)
+def _explain_noise_minimum(analysis: Analysis) -> str:
+    """Return the advice to change nothing if PX4 limits the noise from below; else ""."""
+    parameters, origin = analysis.flight.log.parameters, analysis.source.origin
+    gnss_noise_m = parameters.get(GNSS_POS.noise, MODEL_PARAMETERS[GNSS_POS.noise].default)
     if (
-        analysis.source.origin.is_fused_as_gnss
+        origin.is_fused_as_gnss
         and (reported_noise_m := _find_reported_noise_m(analysis)) >= gnss_noise_m
     ):
         return (
             "Change nothing: EKF2 never assumes a GNSS position noise below the noise that the "
             f"receiver reports ({reported_noise_m:.2g} m)."
         )
+    # While EKF2 fuses GNSS too, a smaller EKF2_EVP_NOISE has no effect
     if (
-        not analysis.source.origin.is_vision
-        or not has_fused_aid(analysis.flight.ekf2)
-        or parameters.get(EV_POS.noise, 0.0) > gnss_noise_m
+        origin.is_vision
+        and has_fused_aid(analysis.flight.ekf2)
+        and parameters.get(EV_POS.noise, 0.0) <= gnss_noise_m
     ):
-        return ""
-    return (
-        "Change nothing: while EKF2 also fuses GNSS, the noise of vision positions in PX4 is at "
-        f"least {GNSS_POS.noise} ({gnss_noise_m:g} m)."
-    )
+        return (
+            "Change nothing: while EKF2 also fuses GNSS, the noise of vision positions in PX4 is "
+            f"at least {GNSS_POS.noise} ({gnss_noise_m:g} m)."
+        )
+    return ""
 
 
 def _has_default_noises(
@@ -400,11 +416,12 @@ def _has_default_noises(
         )
     parameter, log = find_aid(analysis, result.axis.name).noise, analysis.flight.log
     default_noise = log.find_default_value(parameter)
+    if log.parameters.get(parameter, default_noise) != default_noise:
+        return False
+    # EKF2 does not use the parameter if R differs from it, for example because of reported
+    # variances. Unknown R (NaN) counts as the default
     ratio = find_ekf2_noise_m(result) / default_noise
-    # `not >` instead of `<=`: unknown R (NaN) counts as the default
-    return log.parameters.get(parameter, default_noise) == default_noise and not (
-        max(ratio, 1.0 / ratio) > MAX_RATIO_OF_EQUAL_NOISES
-    )
+    return not max(ratio, 1.0 / ratio) > MAX_RATIO_OF_EQUAL_NOISES
 
 
 def _find_action_for_wrong_sigma(
@@ -429,12 +446,14 @@ def _find_action_for_wrong_sigma(
 def _find_sigma_action_without_replay(
     analysis: Analysis, result: AxisComparison, axis_tuning: AxisTuning
 ) -> str:
+    """Return the change of EKF2's noise to its estimate, if EKF2 cannot be replayed."""
     aid, noise = find_aid(analysis, result.axis.name), axis_tuning.sigma_z
     ekf2_summary = result.filters["ekf2"]
     assert not isinstance(ekf2_summary, Unavailable)
     if not (estimated_noise_m := noise.value or noise.high):
         return UNEXPLAINED_SIGMA_ACTION
     noise_m, used_noise_m = max(estimated_noise_m, EKF2_MIN_NOISE_M), find_ekf2_noise_m(result)
+    # Above 1 if a change to the estimate corrects σ
     ratio = used_noise_m / noise_m if ekf2_summary.sigma_ratio < 1.0 else noise_m / used_noise_m
     if not ratio > MAX_RATIO_OF_EQUAL_NOISES:  # the comparison is False for NaN
         return (
@@ -443,6 +462,7 @@ def _find_sigma_action_without_replay(
         )
     parameters, reported_noise_m = analysis.flight.log.parameters, 0.0
     noise_setting_m = parameters.get(aid.noise, np.inf)
+    # EKF2 then used the variances in the messages
     if used_noise_m > MIN_USED_TO_PARAMETER_NOISE_RATIO * noise_setting_m:
         reported_noise_m = used_noise_m
     noise_change = make_noise_change(aid, parameters, reported_noise_m, noise_m)

@@ -4,7 +4,7 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
-from px4fuse.core.text import capitalise_first, format_number
+from px4fuse.core.text import capitalise_first_letter, format_number
 from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
 from px4fuse.findings.model import Findings, format_count, make_note, make_warning
 from px4fuse.flight.model import AS_RECEIVED_ORIGIN, Ekf2, Flight, Unavailable
@@ -65,12 +65,13 @@ def detect_lost_data(flight: Flight) -> Findings:
             "Stop logging only after landing. If the file is incomplete, copy the file again.",
             evidence,
         )
-    for topic, count in list(log.dropped.items())[:1]:
+    if log.dropped:
+        topic = next(iter(log.dropped))
         yield make_note(
             "samples_out_of_order",
-            f"{count} samples of the topic {topic} have wrong timestamps: zero, or earlier than "
-            "the previous timestamp. Possible cause: a clock was set back, or messages arrived in "
-            "another order.",
+            f"{log.dropped[topic]} samples of the topic {topic} have wrong timestamps: zero, or "
+            "earlier than the previous timestamp. Possible cause: a clock was set back, or "
+            "messages arrived in another order.",
             "Synchronise the clock of the sending computer before take-off (TIMESYNC).",
             {"notes": len(log.dropped)},
         )
@@ -131,7 +132,7 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
 
 
 def _capitalise_note(note: str) -> str:
-    return note if "." in note.split(" ", 1)[0] else capitalise_first(note)
+    return note if "." in note.split(" ", 1)[0] else capitalise_first_letter(note)
 
 
 def detect_unavailable_data(analysis: Analysis) -> Findings:
@@ -170,8 +171,8 @@ def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
         return
     rate_hz = source.compute_rate_hz()
     sdlog_profile = int(parameters.get("SDLOG_PROFILE", DEFAULT_SDLOG_PROFILE))
-    reason_by_source = {item.source: item.reason for item in reversed(analysis.missing)}
-    reason = reason_by_source.get(VISION_TOPIC, f"{VISION_TOPIC} is not in this log")
+    reasons = (item.reason for item in analysis.missing if item.source == VISION_TOPIC)
+    reason = next(reasons, f"{VISION_TOPIC} is not in this log")
     yield make_warning(
         "source_not_logged",
         f"The log lacks the {source.positions_text} that PX4 received. Reason: {reason}. "

@@ -8,14 +8,14 @@ from px4fuse.comparison.model import FilterName, PreparedComparison
 from px4fuse.comparison.rerun_effects import Rerun
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.findings.cause_text import format_sender_action
-from px4fuse.findings.model import Findings, finding, make_error, make_warning
+from px4fuse.findings.model import Findings, error_if, finding, make_error, make_warning
 from px4fuse.findings.source_positions import find_low_pass
 from px4fuse.findings.source_stamps import find_timesync_convergence
 from px4fuse.flight.ekf2_parameters import GNSS_POS, RECEIVER_DELAY_PARAMETERS
 from px4fuse.flight.model import Unavailable
 
 # Minimum time offset (s) for severity "error"; it causes a position error of 0.1 m at 1 m/s
-MIN_OFFSET_FOR_ERROR_S = 0.10
+MIN_OFFSET_FOR_SEVERITY_ERROR_S = 0.10
 # Maximum ratio of KF's position RMSE with corrected timestamps to the RMSE without correction
 MAX_RMSE_RATIO_AFTER_CORRECTION = 1.005
 CORRECT_AT_SENDER_ACTION = "Correct the position timestamps before sending."
@@ -70,7 +70,7 @@ def detect_time_offset(analysis: Analysis, time_offset: SourceTimeOffset) -> Fin
     if offset_s < 0.0:
         offset_s, low_s, high_s, late_or_early = -offset_s, -high_s, -low_s, "late"
     yield finding(
-        "error" if offset_s > MIN_OFFSET_FOR_ERROR_S else "warning",
+        error_if(offset_s > MIN_OFFSET_FOR_SEVERITY_ERROR_S),
         "source_time_offset",
         f"Position timestamps are {offset_s:.2f} s {late_or_early}. The time offset estimated from "
         f"IMU and positions is {offset_s:.3f} s (95 % {low_s:.3f} to {high_s:.3f} s). At 1 m/s, "
@@ -91,10 +91,8 @@ def truth_refutes_offset(rerun: Rerun | None) -> bool:
 
 
 def _find_rerun(analysis: Analysis, filter_name: FilterName, kind: str) -> Rerun | None:
-    for rerun in analysis.select_main_reruns():
-        if (rerun.filter, rerun.kinds) == (filter_name, (kind,)):
-            return rerun
-    return None
+    reruns = analysis.select_main_reruns()
+    return next((run for run in reruns if (run.filter, run.kinds) == (filter_name, (kind,))), None)
 
 
 def _compute_rmse_ratio(rerun: Rerun | None) -> float:
@@ -124,7 +122,7 @@ def _find_offset_remedy(analysis: Analysis, time_offset: SourceTimeOffset) -> st
     if delay_parameter := _find_receiver_delay_parameter(analysis):
         return f"Check the delay of the GNSS receiver ({delay_parameter})."
     if analysis.source.alignment is not None:
-        total_offset_s = compute_offset_for_option_s(analysis, time_offset)
+        total_offset_s = compute_clock_offset_option_s(analysis, time_offset)
         return f"Run again with --clock-offset {total_offset_s:.3f}."
     position_age_ms = (remedy.find_logged_delay_ms(analysis) or 0.0) - 1e3 * time_offset.remaining_s
     action = format_sender_action(analysis.source, time_offset.remaining_s)
@@ -133,7 +131,7 @@ def _find_offset_remedy(analysis: Analysis, time_offset: SourceTimeOffset) -> st
     return f"{action}."
 
 
-def compute_offset_for_option_s(
+def compute_clock_offset_option_s(
     comparison: PreparedComparison, time_offset: SourceTimeOffset
 ) -> float:
     """Return the value (s) of ``--clock-offset`` that corrects a time offset."""
@@ -157,19 +155,22 @@ def detect_wrong_delay(analysis: Analysis, time_offset: SourceTimeOffset) -> Fin
     estimated_delay_ms = remedy.estimate_delay_if_not_as_logged_ms(analysis, time_offset, delay_ms)
     if estimated_delay_ms is None:
         return
+    # The time offset of late timestamps is negative, the delay positive
     low_ms, high_ms = (
-        1e3 * (source.assumed_delay_s - end_s) for end_s in reversed(time_offset.interval_s)
+        1e3 * (source.assumed_delay_s - offset_s) for offset_s in reversed(time_offset.interval_s)
     )
-    delay_text = f"the positions are {estimated_delay_ms:.0f} ms late"
     if low_ms <= 0.0 <= high_ms:
         delay_text = "the positions have no significant delay"
     elif estimated_delay_ms < 0.0:
         delay_text = f"the timestamps are {-estimated_delay_ms:.0f} ms early"
         low_ms, high_ms = -high_ms, -low_ms
+    else:
+        delay_text = f"the positions are {estimated_delay_ms:.0f} ms late"
     parameter = remedy.find_aid(analysis).delay
-    finding_id, action = "ekf2_ev_delay_wrong", CORRECT_AT_SENDER_ACTION
-    evidence = {"ekf2_ev_delay_ms": delay_ms, "asked_ms": estimated_delay_ms}
-    if is_gnss:
+    if not is_gnss:
+        finding_id, action = "ekf2_ev_delay_wrong", CORRECT_AT_SENDER_ACTION
+        evidence = {"ekf2_ev_delay_ms": delay_ms, "asked_ms": estimated_delay_ms}
+    else:
         finding_id, action = "ekf2_gps_delay_wrong", CHECK_RECEIVER_ACTION
         evidence = {
             "ekf2_gps_delay_ms": delay_ms,

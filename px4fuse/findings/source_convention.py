@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.convention.axes import METRES_PER_UNIT
-from px4fuse.convention.check import check_convention
+from px4fuse.convention.check import determine_source_convention
 from px4fuse.convention.correction import (
     MIN_RESIDUAL_ROTATION_DEG,
     ConventionFaults,
@@ -20,7 +20,7 @@ from px4fuse.convention.texts import (
     FRAME_AXES,
     describe_axes,
     describe_quaternion_conversion,
-    describe_unit,
+    describe_wrong_unit,
     find_axes_in_file,
     format_axes,
     format_delay,
@@ -53,7 +53,7 @@ def detect_wrong_orientation(flight: Flight, source: PositionTrack) -> Findings:
 
     Unlike :func:`detect`, it needs no comparison of KF and EKF2, and does not check positions.
     """
-    convention = check_convention(flight, source)
+    convention = determine_source_convention(flight, source)
     if convention is not None:
         faults = find_convention_faults(convention, flight, source.frame)
         yield from _detect_orientation_faults(convention, faults, source)
@@ -76,28 +76,32 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
     findings_of_unusable_positions = [
         item for item in findings if FINDING_CATALOGUE[item.id].report_class == "unusable"
     ]
+    effects = [
+        item
+        for item in findings
+        if FINDING_CATALOGUE[item.id].status_if_convention_wrong == "effect"
+    ]
     if findings_of_unusable_positions:
-        # A lever arm does not change the heading of the orientation
-        has_only_lever_arm_finding = {item.id for item in findings_of_unusable_positions} == {
-            "source_lever_arm"
-        }
+        # A convention found with unusable positions is not valid, nor are findings from positions.
+        # But a lever arm does not change the heading of the orientation
+        if {item.id for item in findings_of_unusable_positions} != {"source_lever_arm"}:
+            cause_findings = []
         cause_findings = [
-            item
-            for item in cause_findings
-            if has_only_lever_arm_finding and item.id == "source_orientation_wrong"
-        ] + findings_of_unusable_positions
+            *(item for item in cause_findings if item.id == "source_orientation_wrong"),
+            *findings_of_unusable_positions,
+        ]
         findings = [
             item
             for item in findings
             if item in cause_findings
-            or _is_effect_of_wrong_convention(item)
+            or item in effects
             or (
                 FINDING_CATALOGUE[item.id].group in POSITION_INDEPENDENT_FINDING_GROUPS
                 and item.id != "accelerometer_bias"
             )
         ]
     elif faults.orientation == "copied" and not faults.has_position_fault:
-        cause_findings = []
+        cause_findings = []  # a copied orientation does not affect other findings
     cause_findings += [
         item
         for item in findings
@@ -114,30 +118,23 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
         # a drifting clock has no constant time offset
         and not (faults.clock_drift and item.id == "source_time_offset")
     ]
+    # With unknown axes, findings that need the positions are not valid
     if faults.is_ambiguous and not findings_of_unusable_positions:
-        return [
-            *cause_findings,
-            *(
-                item
-                for item in other_findings
-                if _is_effect_of_wrong_convention(item) or item.severity == "note"
-            ),
+        return cause_findings + [
+            item for item in other_findings if item in effects or item.severity == "note"
         ]
-    findings_caused_by_convention = [
-        replace(item, message=f"{item.title}.", caused_by=cause_findings[0].id)
-        for item in other_findings
-        if _is_effect_of_wrong_convention(item) and item.caused_by is None
-    ]
+    first_cause, *other_causes = cause_findings
     return [
-        cause_findings[0],
-        *findings_caused_by_convention,
-        *cause_findings[1:],
-        *(item for item in other_findings if not _is_effect_of_wrong_convention(item)),
+        first_cause,
+        # Effects of other causes are dropped: without the wrong convention, they may be absent
+        *(
+            replace(item, message=f"{item.title}.", caused_by=first_cause.id)
+            for item in other_findings
+            if item in effects and item.caused_by is None
+        ),
+        *other_causes,
+        *(item for item in other_findings if item not in effects),
     ]
-
-
-def _is_effect_of_wrong_convention(item: Finding) -> bool:
-    return FINDING_CATALOGUE[item.id].status_if_convention_wrong == "effect"
 
 
 def _detect_position_faults(
@@ -154,14 +151,17 @@ def _detect_position_faults(
     stated_frame = source.alignment.frame.upper() if source.alignment else "NED"
     axes = find_axes_in_file(convention.axes, stated_frame)
     rotation_deg = faults.rotation_deg
-    has_hardly_rotated_file = (
-        is_position_file and abs(convention.rotation_deg) <= MIN_RESIDUAL_ROTATION_DEG
+    # A rotation of a file by a multiple of 90° to a usual frame is another --position-frame
+    is_file_in_other_frame = (
+        rotation_deg
+        and is_position_file
+        and abs(convention.rotation_deg) <= MIN_RESIDUAL_ROTATION_DEG
+        and axes in FRAME_AXES.values()
     )
-    if faults.has_wrong_axes or (
-        rotation_deg and has_hardly_rotated_file and axes in FRAME_AXES.values()
-    ):
+    if faults.has_wrong_axes or is_file_in_other_frame:
         orientation = convention.orientation
         frame_sentence = "The analysis uses the positions converted to NED."
+        # The frame of the orientation is then the best guess for the frame of the positions
         if faults.is_north_unknown and orientation and axes not in FRAME_AXES.values():
             axes = FRAME_AXES.get(orientation.frames[-3:], axes)
             frame_sentence = (
@@ -187,7 +187,9 @@ def _detect_position_faults(
             "gyroscopes": "the heading at take-off",
             "GNSS": "the GNSS positions",
         }[convention.heading_from]
-        other_cause = "" if convention.heading_from == "GNSS" else f", or {reference_text} is wrong"
+        other_cause_text = (
+            "" if convention.heading_from == "GNSS" else f", or {reference_text} is wrong"
+        )
         action = (
             "Align the frame of the source with north, or rotate positions and orientation by "
             f"{-rotation_deg:+.0f}° before sending."
@@ -198,12 +200,12 @@ def _detect_position_faults(
             "source_frame_misaligned",
             f"{positions_text} are rotated by {rotation_deg:+.0f}° (clockwise from above) "
             f"relative to {reference_text}. The x axis of the source does not point north"
-            f"{other_cause}. {evidence_sentence} The analysis rotates the positions to NED.",
+            f"{other_cause_text}. {evidence_sentence} The analysis rotates the positions to NED.",
             action,
             _make_evidence(convention, "rotation") | {"misalignment_deg": rotation_deg},
         )
     if faults.has_wrong_unit:
-        fault_text, action = describe_unit(
+        fault_text, action = describe_wrong_unit(
             convention.unit, positions_text, is_file=is_position_file
         )
         distance_ratio = convention.scale / METRES_PER_UNIT[convention.unit]

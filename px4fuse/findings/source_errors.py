@@ -17,11 +17,11 @@ from px4fuse.comparison.error_patterns import (
     LocalResiduals,
     compute_local_residuals,
     find_attitude_delay,
-    find_offset_variation,
     find_periodic_error,
     find_speed_dependent_noise,
+    find_time_offset_variation,
     find_timestamp_jitter,
-    fit_errors,
+    fit_errors_against_truth,
 )
 from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.core.text import format_metres, format_number, format_ratio
@@ -31,7 +31,9 @@ from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.findings.model import (
     WHITE_TO_ASSUMED_NOISE_RATIO_KEY,
     Findings,
+    error_if,
     find_source_texts,
+    finding,
     format_percent,
     make_error,
     make_note,
@@ -56,9 +58,9 @@ MIN_CORRELATED_NOISE_LOG_LIKELIHOOD_RATIO_NATS = 5.0
 # Minimum time-correlated error (m, 1 σ): timestamp errors and motion alone cause a few mm
 MIN_CORRELATED_NOISE_SIGMA_M = 0.005
 # Minimum fraction of repeated positions for a warning
-MIN_REPEATED_FRACTION = 0.05
+MIN_REPEATED_POSITION_FRACTION = 0.05
 # Minimum fraction of repeated positions for severity "error"
-MIN_REPEATED_FRACTION_FOR_ERROR = 0.3
+MIN_REPEATED_FRACTION_FOR_SEVERITY_ERROR = 0.3
 # Minimum number of repeated positions for a finding
 MIN_REPEATED_POSITION_COUNT = 10
 # Minimum ratio for a warning: larger ÷ smaller position noise (σ) of two horizontal axes
@@ -68,11 +70,11 @@ MIN_NOISY_PART_SIGMA_RATIO = 2.0
 # Minimum ratio of the noise in one flight part to the noise in the rest, after removal of outliers
 MIN_NOISY_PART_SIGMA_RATIO_WITHOUT_OUTLIERS = 1.5
 # Minimum ratio of the noise in one flight part to the noise in the rest, for severity "error"
-MIN_NOISY_PART_SIGMA_RATIO_FOR_ERROR = 4.0
+MIN_NOISY_PART_SIGMA_RATIO_FOR_SEVERITY_ERROR = 4.0
 # Minimum scale factor error (ratio minus 1) against ground truth: 0.8 m in 10 m
 MIN_SCALE_ERROR_AGAINST_TRUTH = 0.08
 # Minimum jitter (s) for severity "error"; it causes a position error of 3 cm at 1 m/s
-MIN_JITTER_FOR_ERROR_S = 0.03
+MIN_JITTER_FOR_SEVERITY_ERROR_S = 0.03
 # Minimum amplitude (m) of a periodic error for severity "error": twice the noise of a good UWB
 # system
 MIN_SEVERE_PERIODIC_ERROR_M = 0.2
@@ -90,7 +92,7 @@ def detect(analysis: Analysis) -> Findings:
     if local_residuals is None:
         return
     yield from detect_jitter_and_speed_noise(analysis, local_residuals)
-    error_fit = fit_errors(analysis, local_residuals)
+    error_fit = fit_errors_against_truth(analysis, local_residuals)
     if error_fit is not None:
         yield from detect_periodic_errors_and_offset_changes(analysis, error_fit)
         if not analysis.source.origin.is_gnss:  # GNSS has no scale factor error
@@ -140,7 +142,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         f"correlation time {time_text}. The remaining error is white noise of "
         f"{noise.white_m:.2g} m (1 σ). KF and EKF2 assume independent errors: both follow the "
         "correlated error, and their σ is too small.",
-        f"{find_source_texts(analysis.source).slow_error_check}.",
+        f"{find_source_texts(analysis).slow_error_check}.",
         evidence,
     )
 
@@ -161,9 +163,10 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
     positions_m = analysis.source_samples[Columns.POSITION].dropna()
     is_repeated = (positions_m.diff() == 0.0).all(axis=1)[1:]
     count, fraction = int(is_repeated.sum()), float(is_repeated.mean())
-    if count < MIN_REPEATED_POSITION_COUNT or fraction < MIN_REPEATED_FRACTION:
+    if count < MIN_REPEATED_POSITION_COUNT or fraction < MIN_REPEATED_POSITION_FRACTION:
         return
-    yield (make_error if fraction >= MIN_REPEATED_FRACTION_FOR_ERROR else make_warning)(
+    yield finding(
+        error_if(fraction >= MIN_REPEATED_FRACTION_FOR_SEVERITY_ERROR),
         "source_samples_repeated",
         f"{count} of {len(is_repeated)} {analysis.source.positions_text} repeat the previous "
         f"position ({format_percent(fraction)}). KF and EKF2 use each repetition as a measurement.",
@@ -192,7 +195,7 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
         or noisy_sigma_low_m <= quiet_sigma_high_m
     ):
         return
-    action = f"{find_source_texts(analysis.source).slow_error_check}."
+    action = f"{find_source_texts(analysis).slow_error_check}."
     evidence = {"smaller_noise_sigma_z_m": quiet_sigma_m, "larger_noise_sigma_z_m": noisy_sigma_m}
     if noisy_axis in analysis.axes:
         action += (
@@ -223,19 +226,16 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
         < MIN_NOISY_PART_SIGMA_RATIO_WITHOUT_OUTLIERS
     ):
         return
-    noise_ratio, start_s, end_s = (
-        noisy_flight_part.sigma_ratio,
-        noisy_flight_part.start_s,
-        noisy_flight_part.end_s,
-    )
-    yield (make_error if noise_ratio >= MIN_NOISY_PART_SIGMA_RATIO_FOR_ERROR else make_warning)(
+    start_s, end_s = noisy_flight_part.start_s, noisy_flight_part.end_s
+    yield finding(
+        error_if(noisy_flight_part.sigma_ratio >= MIN_NOISY_PART_SIGMA_RATIO_FOR_SEVERITY_ERROR),
         "source_noise_varies",
-        f"{analysis.source.kind_name} noise is {noise_ratio:.1f} times larger from "
-        f"{start_s:.0f} to {end_s:.0f} s. Single outliers are not the cause.",
-        f"{find_source_texts(analysis.source).data_link_check} for the time from {start_s:.0f} to "
+        f"{analysis.source.kind_name} noise is {noisy_flight_part.sigma_ratio:.1f} times larger "
+        f"from {start_s:.0f} to {end_s:.0f} s. Single outliers are not the cause.",
+        f"{find_source_texts(analysis).data_link_check} for the time from {start_s:.0f} to "
         f"{end_s:.0f} s. Send a variance with each position, or analyse the noisy part separately "
         "(--start, --end).",
-        {"ratio": noise_ratio, "first_s": start_s, "until_s": end_s},
+        {"ratio": noisy_flight_part.sigma_ratio, "first_s": start_s, "until_s": end_s},
         ((start_s, end_s),),
     )
 
@@ -243,7 +243,8 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
 def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResiduals) -> Findings:
     jitter_s, clock_map = find_timestamp_jitter(local_residuals), analysis.source.clock_map
     if jitter_s is not None and (clock_map is None or clock_map.distinct_stamps is None):
-        yield (make_error if jitter_s >= MIN_JITTER_FOR_ERROR_S else make_warning)(
+        yield finding(
+            error_if(jitter_s >= MIN_JITTER_FOR_SEVERITY_ERROR_S),
             "source_timestamp_jitter",
             f"The timestamps of the {analysis.source.positions_text} jitter by "
             f"{1e3 * jitter_s:.0f} ms (1 σ). At 1 m/s this is a position error of "
@@ -271,22 +272,19 @@ def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: Err
     periodic_error = find_periodic_error(error_fit)
     positions_text = analysis.source.positions_text
     if periodic_error is not None:
-        yield (
-            make_error
-            if periodic_error.amplitude_m >= MIN_SEVERE_PERIODIC_ERROR_M
-            else make_warning
-        )(
+        yield finding(
+            error_if(periodic_error.amplitude_m >= MIN_SEVERE_PERIODIC_ERROR_M),
             "source_error_periodic",
             f"The error of the {positions_text} is periodic: amplitude "
             f"{format_metres(periodic_error.amplitude_m)} m, period {periodic_error.period_s:.1f} "
             f"s. This sinusoid explains {format_percent(min(periodic_error.fraction, 1.0))} of the "
             "slow errors against ground truth. Innovations hardly show this error.",
-            f"{find_source_texts(analysis.source).slow_error_check}. Look for a process with this "
+            f"{find_source_texts(analysis).slow_error_check}. Look for a process with this "
             "period, such as a control loop.",
             periodic_error._asdict(),
         )
         return
-    clock, offset_change = analysis.time_offset, find_offset_variation(error_fit)
+    clock, offset_change = analysis.time_offset, find_time_offset_variation(error_fit)
     if isinstance(clock, SourceTimeOffset) and clock.has_changed():
         return  # source_clock.py reports a change of the time offset
     if offset_change is not None:
@@ -312,7 +310,7 @@ def detect_scale_error(analysis: Analysis, error_fit: ErrorFit) -> Findings:
             error_fit.scale,
             error_fit.scale_error_sigma,
             f"ground truth (± {format_percent(1.96 * error_fit.scale_error_sigma, 1)}, 95 %)",
-            f"{find_source_texts(analysis.source).scale_check}.",
+            f"{find_source_texts(analysis).scale_check}.",
         )
 
 

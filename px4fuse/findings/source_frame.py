@@ -9,11 +9,12 @@ from px4fuse.comparison.remedy import find_aid, format_changes
 from px4fuse.core.text import lowercase_first_letter
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding
-from px4fuse.findings.ekf2_fusion import FUSED_FRACTION_FOR_ERROR
+from px4fuse.findings.ekf2_fusion import MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR
 from px4fuse.findings.ekf2_settings import find_confirmed_noise_rerun
 from px4fuse.findings.model import (
     Findings,
     compute_flag_fraction,
+    error_if,
     finding,
     magnetometer_advice,
     make_note,
@@ -60,7 +61,7 @@ def make_frd_positions_finding(analysis: Analysis) -> Finding:
             note_action += " Give the ULog of this flight, too: it shows EKF2's frame."
             return make_note("source_frame_frd", message, note_action)
         fused_fraction = compute_flag_fraction(ekf2.fusion_flags["yaw"], analysis.segment)
-        if fused_fraction > FUSED_FRACTION_FOR_ERROR:
+        if fused_fraction > MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR:
             message = f"{fault} EKF2 fused the yaw of {sensor_name}, so EKF2's axes are also FRD."
             return make_note("source_frame_frd", message, note_action)
     action = "Send the position in NED."
@@ -75,46 +76,47 @@ def make_frd_positions_finding(analysis: Analysis) -> Finding:
 
 def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Findings:
     """Detect a yaw misalignment between positions and IMU."""
-    rotation_deg = math.remainder(heading_error.misalignment_deg, 360.0)
-    sigma_deg = heading_error.sigma_deg
+    source, systematic_errors = analysis.source, analysis.systematic_errors
     if heading_error.drifts:
         if not _truth_contradicts_heading_drift(analysis.flight, heading_error):
             yield _make_heading_drift_finding(analysis, heading_error)
         return
-    systematic_errors = analysis.systematic_errors
+    # An accelerometer bias resembles a rotation. Estimated together, the rotation is insignificant
     is_explained_by_bias = (
         not isinstance(systematic_errors, Unavailable)
-        and analysis.source.orientation is None
+        and source.orientation is None
         and abs(systematic_errors.rotation_rad.value)
         < MIN_MISALIGNMENT_SIGMAS * systematic_errors.rotation_rad.sigma
     )
+    rotation_deg = math.remainder(heading_error.misalignment_deg, 360.0)
+    sigma_deg = heading_error.sigma_deg
     if is_explained_by_bias or abs(rotation_deg) < max(
         MIN_MISALIGNMENT_SIGMAS * sigma_deg, MIN_HEADING_ERROR_DEG
     ):
         return
-    finding_id, reference = "ekf2_heading_error", "EKF2's heading"
-    calibration_advice = magnetometer_advice(analysis.flight)
-    if analysis.source.origin.is_gnss:
+    is_frame_of_ekf2 = source.name == ALIGNED_VISION_TOPIC
+    if source.origin.is_gnss:
         reason = "GNSS positions refer to true north, so EKF2's heading is wrong by this rotation."
         _, action = _explain_gnss_heading_error(analysis)
-        calibration_advice = ""
-    elif analysis.source.name == ALIGNED_VISION_TOPIC:
+    elif is_frame_of_ekf2:
         reason = "The positions that EKF2 rotated into its own frame do not fit the IMU."
         action = "Align the positioning frame with north."
     else:
-        finding_id, reference = "source_frame_misaligned", "the IMU"
         reason = (
             "The positioning frame is not aligned with north, or the magnetic heading is wrong."
         )
         action = f"Rotate the positions by {-rotation_deg:+.0f}° before they are sent."
-        if analysis.source.alignment is not None:
+        if source.alignment is not None:
             action = "Run again with --position-yaw auto."
-    if calibration_advice:
-        action += f" Alternatively: {lowercase_first_letter(calibration_advice)}"
+    if not source.origin.is_gnss and (advice := magnetometer_advice(analysis.flight)):
+        action += f" Alternatively: {lowercase_first_letter(advice)}"
+    finding_id, reference = "source_frame_misaligned", "the IMU"
+    if source.origin.is_gnss or is_frame_of_ekf2:
+        finding_id, reference = "ekf2_heading_error", "EKF2's heading"
     yield finding(
-        "error" if abs(rotation_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
+        error_if(abs(rotation_deg) >= MIN_SEVERE_HEADING_ERROR_DEG),
         finding_id,
-        f"{analysis.source.positions_text} are rotated by {rotation_deg:+.0f}° relative to "
+        f"{source.positions_text} are rotated by {rotation_deg:+.0f}° relative to "
         f"{reference}. The rotation (± {1.96 * sigma_deg:.0f}°, 95 %) is clockwise from above and "
         f"constant over the flight. {reason}",
         action,
@@ -167,31 +169,31 @@ def _make_heading_drift_finding(analysis: Analysis, heading_error: HeadingError)
     estimation_data_text = "positions and IMU"
     if heading_error.by == "orientation":
         estimation_data_text = f"the orientation of {source.kind_name}"
-    calibration_advice, action = magnetometer_advice(analysis.flight), ""
-    possible_cause = "a magnetometer indoors" if calibration_advice else "a gyroscope bias"
-    if source.orientation is not None:
-        possible_cause += ", or heading drift of the odometry"
-        parameters = analysis.flight.log.parameters
-        if not int(parameters.get(EV_POS.switch, 0.0)) & EV_CTRL_YAW_MASK:
-            action = "Let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
     if source.origin.is_gnss:
-        calibration_advice = ""
         possible_cause, action = _explain_gnss_heading_error(analysis)
+        actions = [action]
+    else:
+        actions = [magnetometer_advice(analysis.flight)]
+        possible_cause = "a magnetometer indoors" if actions[0] else "a gyroscope bias"
+        if source.orientation is not None:
+            possible_cause += ", or heading drift of the odometry"
+            ev_ctrl = int(analysis.flight.log.parameters.get(EV_POS.switch, 0.0))
+            if not ev_ctrl & EV_CTRL_YAW_MASK:
+                actions.append("Let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3).")
     return finding(
-        "error" if abs(heading_change_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
+        error_if(abs(heading_change_deg) >= MIN_SEVERE_HEADING_ERROR_DEG),
         "ekf2_heading_error",
         f"EKF2's heading drifts by {heading_change_deg:+.0f}° relative to the "
         f"{source.positions_text}. The heading error is {' and '.join(error_texts)} "
         f"(clockwise from above, estimated from {estimation_data_text}). A constant rotation of "
         f"the positions cannot correct the drift. Possible cause: {possible_cause}.",
-        " Alternatively: ".join(filter(None, (calibration_advice, action)))
-        or "Check the heading source of EKF2.",
+        " Alternatively: ".join(filter(None, actions)) or "Check the heading source of EKF2.",
         {
             "from_deg": first_part.heading_error_deg,
             "to_deg": last_part.heading_error_deg,
             "from_s": first_part.start_s,
             "to_s": last_part.end_s,
-            "p": max(heading_error.drift_p, 1e-300),
+            "p": max(heading_error.drift_p, 1e-300),  # not 0 after an underflow
         },
     )
 
@@ -203,7 +205,7 @@ def detect_uncertain_alignment(analysis: Analysis) -> Findings:
         return
     for sentence in (*alignment.misplaced, *alignment.warnings):
         yield finding(
-            "error" if sentence in alignment.misplaced else "warning",
+            error_if(sentence in alignment.misplaced),
             "position_file_alignment",
             f"{sentence.rstrip('.')}.",
             "If time offset, frame and yaw of the file are known, run again with --clock-offset, "

@@ -1,5 +1,7 @@
 """Detect gaps in the position source, positions lost in the recording, and downsampling."""
 
+from itertools import pairwise
+
 import numpy as np
 import pandas as pd
 
@@ -13,9 +15,10 @@ from px4fuse.core.text import format_metres
 from px4fuse.ekf2.aids import MAX_TIME_WITHOUT_FUSION_S
 from px4fuse.ekf2.fusion_conditions import EV_START_INTERVAL_S
 from px4fuse.filter.kalman import predict_track
-from px4fuse.finding import Finding, Severity
+from px4fuse.finding import Finding
 from px4fuse.findings.model import (
     Findings,
+    error_if,
     find_source_texts,
     finding,
     format_percent,
@@ -40,7 +43,7 @@ MIN_FRACTION_OF_TWO_MOST_FREQUENT_INTERVALS = 0.85
 MIN_FRACTION_OF_RARER_INTERVAL_LENGTH = 0.1
 # Maximum RMS deviation of the intervals from multiples of a tested source period, as fraction of
 # the period, to report downsampling. Intervals with jitter have 0.03, random intervals 0.29
-MAX_ROUNDING_RMS_ERROR = 0.06
+MAX_RMS_ROUNDING_ERROR_IN_PERIODS = 0.06
 # px4fuse searches the period of a downsampled source among the median interval ÷ n, n = 1, 2, … to
 # this value
 MAX_SOURCE_PERIODS_PER_MEDIAN_INTERVAL = 4
@@ -59,17 +62,13 @@ def detect(analysis: Analysis) -> Findings:
 
 def detect_source_gaps(analysis: Analysis) -> Findings:
     """Detect gaps in the position source."""
-    whole_flight, source, ekf2 = (
-        analysis.segment.whole_flight,
-        analysis.source,
-        analysis.flight.ekf2,
-    )
+    source, whole_flight = analysis.source, analysis.segment.whole_flight
     gaps, gaps_only_in_log = list[Span](), list[Span]()
-    invalid_times_s = analysis.source.invalid_reasons.index
+    invalid_times_s = source.invalid_reasons.index
     for start_s, end_s in analysis.events.gaps:
         if np.any((invalid_times_s > start_s) & (invalid_times_s < end_s)):
             continue  # source_values.py reports these invalid positions
-        aids = _find_fused_aids(ekf2, (start_s, end_s))
+        aids = _find_fused_aids(analysis.flight.ekf2, (start_s, end_s))
         # If EKF2 fused positions during the gap, they are only missing in the log. Positions from a
         # file (with an alignment) are not from the log: their gaps are real
         if source.origin.aid in aids and source.alignment is None:
@@ -85,10 +84,10 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
         duration_text = f"{end_s - start_s:.1f} s"
         if len(spans) > 1:
             duration_text += f", the longest of {len(spans)} gaps"
-        if spans is gaps:
+        if finding_id == "source_gap":
             errors_text = describe_errors_after_gap(analysis, (start_s, end_s))
             message = f"No position for {duration_text}. {errors_text}"
-            action = f"{find_source_texts(source).data_link_check} at {start_s:.1f} s."
+            action = f"{find_source_texts(analysis).data_link_check} at {start_s:.1f} s."
         else:
             message = (
                 f"{source.positions_text} are missing in the log for {duration_text}, but EKF2 "
@@ -126,10 +125,10 @@ def _make_source_stops_or_begins_finding(
         before_or_after, start_or_end_text = "before", "after the start"
         action = "" if source.alignment else " Take off only when positions arrive."
     ekf2_errors_at_end = _find_ekf2_errors_at_end(analysis, span_s)
+    # The error, if known, or else the reported σ
     for name, quantity in (("sigma_m", "reported σ"), ("error_m", "position error")):
-        if name in ekf2_errors_at_end:
-            error_text = f"{format_metres(ekf2_errors_at_end[name])} m"
-            effect_sentence = f" EKF2's {quantity} at {end_s:.1f} s is {error_text}."
+        if (value_m := ekf2_errors_at_end.get(name)) is not None:
+            effect_sentence = f" EKF2's {quantity} at {end_s:.1f} s is {format_metres(value_m)} m."
     ekf2 = analysis.flight.ekf2
     has_aids = isinstance(ekf2, Ekf2) and bool(ekf2.aids)
     aiding_sentence = ""
@@ -138,11 +137,11 @@ def _make_source_stops_or_begins_finding(
         aiding_sentence = f" For {duration_s:.1f} s EKF2 relied on {' and '.join(labels)}."
     is_dead_reckoning = has_aids and not fused_aids and duration_s > MAX_TIME_WITHOUT_FUSION_S
     return finding(
-        "error" if is_dead_reckoning else "warning",
+        error_if(is_dead_reckoning),
         finding_id,
         f"{source.positions_text} {event} in flight at {event_s:.1f} s, {duration_s:.1f} s "
         f"{start_or_end_text} of the flight.{aiding_sentence}{effect_sentence}",
-        f"{find_source_texts(source).data_link_check} for the time {before_or_after} "
+        f"{find_source_texts(analysis).data_link_check} for the time {before_or_after} "
         f"{event_s:.1f} s.{action}",
         {"at_s": event_s, "duration_s": duration_s, **ekf2_errors_at_end},
         (span_s,),
@@ -175,12 +174,13 @@ def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
     """Describe the position errors of KF and EKF2 at the end of a gap."""
     result, end_s = analysis.main, gap_span_s[1]
     axis, ekf2, ekf2_state = result.axis, analysis.flight.ekf2, result.ekf2_tracks.state
-    reference_m = float(axis.measurement_m[np.searchsorted(axis.measurement_time_s, end_s)])
-    quantity = "Distance from the estimate to the first position after the gap,"
     if isinstance(result.truth, pd.DataFrame):
         true_m = result.truth["position_m"]
         reference_m = float(np.interp(end_s, true_m.index, true_m))
         quantity = "Position error at the end of the gap,"
+    else:
+        reference_m = float(axis.measurement_m[np.searchsorted(axis.measurement_time_s, end_s)])
+        quantity = "Distance from the estimate to the first position after the gap,"
     ekf2_text, aiding_sentence = "", "In the gap KF relies on the IMU alone."
     if isinstance(ekf2_state, pd.DataFrame) and len(
         positions_before := ekf2_state["position_m"].loc[:end_s]
@@ -188,7 +188,7 @@ def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
         if other_aids := _find_fused_aids(ekf2, gap_span_s):
             labels_text = " and ".join(aid.label for aid in other_aids)
             aiding_sentence += f" EKF2 also relies on {labels_text}."
-        elif isinstance(ekf2, Ekf2) and ekf2.aids:
+        elif isinstance(ekf2, Ekf2) and ekf2.aids:  # the log shows which sources EKF2 fuses
             aiding_sentence = "In the gap KF and EKF2 rely on the IMU alone."
         ekf2_text = f"EKF2 {format_metres(abs(positions_before.iloc[-1] - reference_m))} m"
         variance = result.ekf2_tracks.variance
@@ -198,6 +198,7 @@ def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
             )
             ekf2_text += f" (σ {format_metres(variance_m2**0.5)} m)"
         ekf2_text += ", "
+    # The position at the end of the gap corrects KF: read the state before this update
     kf_track = predict_track(result.kf_run, np.array([end_s - TIME_BEFORE_UPDATE_S])).iloc[0]
     kf_error_m = abs(kf_track["position_m"] - reference_m)
     kf_sigma_m = kf_track["position_variance_m2"] ** 0.5
@@ -253,7 +254,8 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
 def detect_downsampling(analysis: Analysis) -> Findings:
     """Detect positions that were downsampled before PX4 received them."""
     source = analysis.source
-    # This test is valid only if the timestamps are the times at which PX4 received the positions
+    # This test is valid only if the timestamps are the times at which PX4 received the positions.
+    # EKF2's own copies of the positions, and all origins behind them, have other timestamps
     if (
         source.clock_map is not None
         or source.origin.find_preference_rank() >= ALIGNED_BY_EKF2_ORIGIN.find_preference_rank()
@@ -267,34 +269,31 @@ def detect_downsampling(analysis: Analysis) -> Findings:
         return
     period_s, multiples = period_and_multiples
     lost_fraction = 1.0 - 1.0 / float(np.mean(multiples))
+    # Downsampling to a constant rate makes intervals of n and n + 1 periods. Single lost positions
+    # make intervals of many lengths, and a slower source makes one length
     fraction_by_multiple = np.bincount(multiples.astype(np.intp)) / len(multiples)
-    fraction_sums_of_neighbouring_multiples = fraction_by_multiple[:-1] + fraction_by_multiple[1:]
-    smaller_of_most_frequent_multiples = int(np.argmax(fraction_sums_of_neighbouring_multiples))
-    fractions_of_most_frequent_multiples = fraction_by_multiple[
-        smaller_of_most_frequent_multiples : smaller_of_most_frequent_multiples + 2
-    ]
+    most_frequent_fractions = max(pairwise(fraction_by_multiple), key=sum)
     if (
         lost_fraction < MIN_MISSING_FRACTION_FOR_DOWNSAMPLING
-        or fractions_of_most_frequent_multiples.sum() < MIN_FRACTION_OF_TWO_MOST_FREQUENT_INTERVALS
-        or fractions_of_most_frequent_multiples.min() < MIN_FRACTION_OF_RARER_INTERVAL_LENGTH
+        or sum(most_frequent_fractions) < MIN_FRACTION_OF_TWO_MOST_FREQUENT_INTERVALS
+        or min(most_frequent_fractions) < MIN_FRACTION_OF_RARER_INTERVAL_LENGTH
     ):
         return
     mean_interval_s = float(np.mean(intervals_s))
     rate_hz, source_rate_hz = 1.0 / mean_interval_s, 1.0 / period_s
-    severity: Severity = "warning"
+    is_too_slow_for_fusion = mean_interval_s > EV_START_INTERVAL_S
     message = (
         f"{source.positions_text} arrive at {rate_hz:.2g} Hz, downsampled from "
         f"{source_rate_hz:.2g} Hz. The intervals are whole multiples of {period_s:.3g} s, so "
         f"{format_percent(lost_fraction)} of the positions are missing."
     )
-    if mean_interval_s > EV_START_INTERVAL_S:
-        severity = "error"
+    if is_too_slow_for_fusion:
         message += (
             " EKF2 (v1.14 and later) cannot start fusion at this rate: two positions must arrive "
             f"within {EV_START_INTERVAL_S:g} s."
         )
     yield finding(
-        severity,
+        error_if(is_too_slow_for_fusion),
         "source_downsampled",
         message,
         "Increase the message rate of the positions (MAVROS, bridge, link).",
@@ -318,6 +317,6 @@ def _find_period(intervals_s: Array) -> tuple[float, Array] | None:
             continue
         period_s = float(np.sum(intervals_s) / np.sum(multiples))
         rounding_errors = intervals_s / period_s - multiples
-        if np.mean(rounding_errors**2) ** 0.5 <= MAX_ROUNDING_RMS_ERROR:
+        if np.mean(rounding_errors**2) ** 0.5 <= MAX_RMS_ROUNDING_ERROR_IN_PERIODS:
             return period_s, multiples
     return None

@@ -10,9 +10,10 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison, select_north_and_east
-from px4fuse.core.arrays import Array
+from px4fuse.core.arrays import Array, rms
 from px4fuse.core.text import format_factor, format_metres
-from px4fuse.ekf2.fusion_conditions import constant_coordinates, is_height_only
+from px4fuse.ekf2.fusion_conditions import find_constant_coordinates, is_height_only
+from px4fuse.ekf2.replay import compute_rmse_to_truth
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.hypotheses import (
     OUTLIER_BURST_DURATION_S,
@@ -20,7 +21,7 @@ from px4fuse.filter.hypotheses import (
 )
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.finding import Finding, Severity
+from px4fuse.finding import Finding
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
 from px4fuse.findings.model import (
     CAUSE_KEY,
@@ -29,6 +30,7 @@ from px4fuse.findings.model import (
     RESET_TIME_KEY,
     VEHICLE_ON_GROUND_CAUSE,
     Findings,
+    error_if,
     find_source_texts,
     finding,
     format_percent,
@@ -41,7 +43,6 @@ from px4fuse.findings.source_stamps import detect_arrival_timestamps
 from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import (
     Columns,
-    Ekf2,
     PositionTrack,
     Truth,
     Unavailable,
@@ -63,9 +64,9 @@ MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS = 1.0
 # low-pass filter
 MAX_ESTIMATED_LAG_TO_DELAY_RATIO = 4.0
 # Minimum filter lag (s) for a warning; it causes a position error of 5 cm at 1 m/s
-MIN_LAG_S = 0.05
+MIN_FILTER_LAG_S = 0.05
 # Minimum filter lag (s) for severity "error"; it causes a position error of 10 cm at 1 m/s
-MIN_LAG_FOR_ERROR_S = 0.10
+MIN_FILTER_LAG_FOR_SEVERITY_ERROR_S = 0.10
 # Minimum position jump (m) for a warning: twice the noise of a good UWB system (0.1 m)
 MIN_JUMP_M = 0.2
 # Minimum ratio of a position jump to the σ of time-correlated noise, for a warning
@@ -91,8 +92,6 @@ MAX_MEDIAN_SHIFT_DEVIATION_FRACTION = 0.5
 MAX_JUMP_TO_MEDIAN_INTERVAL_RATIO = 1.5
 # Positions alternate if at least this fraction of the jumps reverses the previous jump
 MIN_OPPOSITE_JUMP_FRACTION = 0.7
-# Maximum time (s) from a position jump to the reset of EKF2 that the jump causes
-MAX_JUMP_TO_RESET_TIME_S = 5.0
 # Maximum number of jumps whose times the finding states
 MAX_LISTED_JUMPS = 8
 # Maximum rounding difference (s) between the timestamps of a position and of its reset_counter
@@ -102,7 +101,7 @@ EV_CTRL_HORIZONTAL_MASK, EV_CTRL_HEIGHT_MASK = 1, 2
 # Maximum time (s) between a jump and the increment of reset_counter: two intervals at 2 Hz
 MAX_JUMP_TO_RESET_COUNTER_TIME_S = 1.0
 # Minimum position jump (m) for severity "error": five times the noise of a good UWB system (0.1 m)
-MIN_JUMP_FOR_ERROR_M = 0.5
+MIN_JUMP_FOR_SEVERITY_ERROR_M = 0.5
 # Minimum scale factor error (ratio minus 1) for a warning: flights without a fault reach 0.11
 MIN_SCALE_ERROR_FOR_WARNING = 0.12
 # Minimum scale factor error (ratio minus 1), for severity "error": 1 m in a distance of 7 m
@@ -112,7 +111,7 @@ MIN_SCALE_ERROR_TO_SIGMA_RATIO = 3.0
 # Minimum fraction of outliers for a warning: normal noise has 0.02 % beyond 3.7 σ
 MIN_OUTLIER_FRACTION = 0.005
 # Minimum fraction of outliers, for severity "error": one outlier in 10 s at 5 Hz
-MIN_OUTLIER_FRACTION_FOR_ERROR = 0.02
+MIN_OUTLIER_FRACTION_FOR_SEVERITY_ERROR = 0.02
 # Minimum number of outliers for a finding
 MIN_OUTLIERS = 3
 # Minimum fraction of positions with logged innovations, to state the number of rejected outliers
@@ -146,7 +145,7 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
         or (time_offset := _find_valid_time_offset(analysis)) is None
         or isinstance(low_pass, Unavailable)
         or low_pass.gain_nats < MIN_LOW_PASS_LOG_LIKELIHOOD_RATIO_NATS
-        or low_pass.lag_s < MIN_LAG_S
+        or low_pass.lag_s < MIN_FILTER_LAG_S
     ):
         return None
     correlated_noise = analysis.time_correlated_noise
@@ -158,8 +157,8 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
         return None
     # At a high position rate, the lag estimated from the correlation of the noise is inaccurate:
     # use the measured delay relative to the IMU
-    lag_limit_s = -MAX_ESTIMATED_LAG_TO_DELAY_RATIO * time_offset.interval_s[0]
-    if low_pass.lag_s > lag_limit_s >= MIN_LAG_S:
+    max_delay_s = -time_offset.interval_s[0]  # late timestamps have a negative offset
+    if low_pass.lag_s > MAX_ESTIMATED_LAG_TO_DELAY_RATIO * max_delay_s >= MIN_FILTER_LAG_S:
         return replace(low_pass, lag_s=-time_offset.offset_s)
     return low_pass
 
@@ -174,14 +173,14 @@ def _find_valid_time_offset(analysis: Analysis) -> SourceTimeOffset | None:
 def detect_low_pass(analysis: Analysis) -> Findings:
     low_pass = find_low_pass(analysis)
     if low_pass is not None:
-        make_finding = make_error if low_pass.lag_s >= MIN_LAG_FOR_ERROR_S else make_warning
-        yield make_finding(
+        yield finding(
+            error_if(low_pass.lag_s >= MIN_FILTER_LAG_FOR_SEVERITY_ERROR_S),
             "source_low_pass_filtered",
             f"{analysis.source.positions_text} are low-pass filtered and lag by "
             f"{low_pass.lag_s:.2f} s. The correlation of successive errors is "
             f"{low_pass.correlation:.1f}; the noise before filtering is {low_pass.sigma_z_m:.2g} "
             "m. KF and EKF2 lag, and their σ is too small.",
-            f"{find_source_texts(analysis.source).low_pass_action} Do not change the timestamps: "
+            f"{find_source_texts(analysis).low_pass_action} Do not change the timestamps: "
             "they are correct.",
             asdict(low_pass),
         )
@@ -203,7 +202,7 @@ def detect_jumps(analysis: Analysis) -> Findings:
     largest_jump = max(jumps, key=lambda jump: jump.size_m)
     size_m, time_s = largest_jump.size_m, largest_jump.time_s
     sigma_m = max(step.sigma for step in largest_jump.step_m)
-    source_texts = find_source_texts(analysis.source)
+    source_texts = find_source_texts(analysis)
     cause = source_texts.jump_causes
     evidence = {"count": len(jumps), "size_m": size_m, "at_s": time_s, "sigma_m": sigma_m}
     nearest_reset_counter_time_s = min(
@@ -216,12 +215,13 @@ def detect_jumps(analysis: Analysis) -> Findings:
     if len(jumps) > 1:
         jump_text = f"jump {len(jumps)} times, by up to {size_m:.2f} m"
     total_step_m = np.sum([[step.value for step in jump.step_m] for jump in jumps], axis=0)
-    returns = np.linalg.norm(total_step_m) < MIN_JUMP_M
+    has_returned_after_jumps = np.linalg.norm(total_step_m) < MIN_JUMP_M
     yield finding(
-        "error" if size_m >= MIN_JUMP_FOR_ERROR_M else "warning",
+        error_if(size_m >= MIN_JUMP_FOR_SEVERITY_ERROR_M),
         "source_position_jump",
         f"{analysis.source.positions_text} {jump_text} at {time_s:.1f} s and "
-        f"{'return afterwards' if returns else 'stay there'}. The IMU does not measure this motion "
+        f"{'return afterwards' if has_returned_after_jumps else 'stay there'}. The IMU does not "
+        "measure this motion "
         f"(± {1.96 * sigma_m:.2f} m, 95 %). {cause} KF and EKF2 follow the jump with consistent "
         "innovations.",
         f"{source_texts.jump_action} Analyse only the time before or after the jump (--start, "
@@ -234,70 +234,61 @@ def detect_jumps(analysis: Analysis) -> Findings:
 def detect_constant_coordinates(analysis: Analysis) -> Findings:
     """Detect coordinates that the source does not measure: they are constant in the whole log."""
     source, parameters = analysis.source, analysis.flight.log.parameters
-    coordinates = constant_coordinates(source)
+    coordinates = find_constant_coordinates(source)
     is_single_coordinate = len(coordinates) == 1
     if not (is_single_coordinate or is_height_only(source)) or (
         is_single_coordinate and source.quantisation_step_m > 0.0
     ):
         return  # rounded positions may be constant in motion
-    values_m = dict(zip("xyz", source.samples[Columns.POSITION].median().tolist(), strict=True))
-    finding_id, make_finding = "source_coordinate_constant", make_error
-    constant_axes_bits, measured_axes_bits = EV_CTRL_HORIZONTAL_MASK, EV_CTRL_HEIGHT_MASK
-    consequence = NO_ESTIMATES_SENTENCE
+    median_m_by_coordinate = dict(
+        zip("xyz", source.samples[Columns.POSITION].median().tolist(), strict=True)
+    )
+    finding_id, make_finding = "source_coordinate_constant", make_warning
+    constant_axes_mask, measured_axes_mask = EV_CTRL_HORIZONTAL_MASK, EV_CTRL_HEIGHT_MASK
     if coordinates == ["z"]:
-        finding_id, make_finding = "source_height_constant", make_warning
-        constant_axes_bits, measured_axes_bits = measured_axes_bits, constant_axes_bits
-        consequence = "The height is not evaluated."
+        finding_id, consequence = "source_height_constant", "The height is not evaluated."
+        constant_axes_mask, measured_axes_mask = EV_CTRL_HEIGHT_MASK, EV_CTRL_HORIZONTAL_MASK
     elif coordinates == ["x", "y"]:
-        make_finding = make_warning
         consequence = "Only the height is evaluated."
+    else:  # only x or only y
+        make_finding, consequence = make_error, NO_ESTIMATES_SENTENCE
     action, coordinates_text = "", " and ".join(coordinates)
     if EV_POS.switch in parameters:
         value = int(parameters[EV_POS.switch])
-        setting_action = f"Leave {EV_POS.switch} at {value}"
-        if value & constant_axes_bits:
-            new_value = value & ~constant_axes_bits | measured_axes_bits
-            setting_action = f"Set {EV_POS.switch} to {new_value}"
-        elif coordinates == ["z"]:
-            make_finding = make_note
-        action = f"{setting_action}, so that EKF2 does not fuse {coordinates_text}. "
-    values_text = ", ".join(f"{values_m[each]:g}" for each in coordinates)
+        if value & constant_axes_mask:
+            new_value = value & ~constant_axes_mask | measured_axes_mask
+            action = f"Set {EV_POS.switch} to {new_value}"
+        else:
+            action = f"Leave {EV_POS.switch} at {value}"
+            if coordinates == ["z"]:  # EKF2 does not fuse the constant height
+                make_finding = make_note
+        action += f", so that EKF2 does not fuse {coordinates_text}. "
+    values_text = ", ".join(f"{median_m_by_coordinate[each]:g}" for each in coordinates)
     yield make_finding(
         finding_id,
         f"The source {source.name} does not measure {coordinates_text} (constant: {values_text} "
         f"m). {consequence}",
         f"{action}Send NaN for a coordinate that is not measured.",
-        {f"{each}_m": value for each, value in values_m.items()},
+        {f"{each}_m": value for each, value in median_m_by_coordinate.items()},
     )
 
 
 def detect_repeated_jumps(analysis: Analysis) -> Findings:
     """Detect repeated jumps: a source corrects its drift, or alternates between two positions."""
-    ekf2 = analysis.flight.ekf2
     times_s, jump_vectors_m, is_announced_by_source = _find_jumps(analysis)
     if len(times_s) < MIN_JUMPS_WITHOUT_RESET_COUNTER and not is_announced_by_source:
         return
     jump_sizes_m = np.linalg.norm(jump_vectors_m, axis=1)
-    ekf2_resets = ekf2.find_horizontal_resets() if isinstance(ekf2, Ekf2) else []
-    first_reset_delays_s = [
-        min((reset.time_s - at_s for reset in ekf2_resets if reset.time_s > at_s), default=np.inf)
-        for at_s in times_s
-    ]
-    reset_delays_s = [delay for delay in first_reset_delays_s if delay < MAX_JUMP_TO_RESET_TIME_S]
-    reset_sentence = ""
-    if reset_delays_s:
-        reset_sentence = (
-            " EKF2 rejects the positions after a jump and resets its position "
-            f"{np.median(reset_delays_s):.1f} s later."
-        )
     jump_times_text = ", ".join(f"{at_s:.1f}" for at_s in times_s[:MAX_LISTED_JUMPS])
     is_reversal = np.sum(jump_vectors_m[1:] * jump_vectors_m[:-1], axis=1) < 0.0
-    counter_sentence = "The source increments reset_counter at each jump."
-    cause_sentence = "The source (VIO or SLAM) drifts, and each jump corrects its drift."
-    if not is_announced_by_source:
+    if is_announced_by_source:
+        counter_sentence = "The source increments reset_counter at each jump."
+        cause_sentence = "The source (VIO or SLAM) drifts, and each jump corrects its drift."
+    else:
         counter_sentence = "The source does not change reset_counter at the jumps."
-        cause_sentence = find_source_texts(analysis.source).jump_causes
+        cause_sentence = find_source_texts(analysis).jump_causes
     action = "Improve the tracking of the source, or let it correct its drift in smaller steps."
+    # Most jumps go back: the source alternates between two positions
     if is_reversal.mean() >= MIN_OPPOSITE_JUMP_FRACTION:
         cause_sentence = (
             "The source alternately sends the positions of two points of the vehicle, "
@@ -308,7 +299,7 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
         "source_relocalises",
         f"The source jumps {len(times_s)} times, by up to {jump_sizes_m.max():.2f} m. Times: "
         f"{jump_times_text} s, about every {np.median(np.diff(times_s)):.0f} s. "
-        f"{counter_sentence} {cause_sentence}{reset_sentence}",
+        f"{counter_sentence} {cause_sentence}",
         f"{action} Analyse the time between two jumps (--start, --end).",
         {
             "count": len(times_s),
@@ -328,17 +319,21 @@ def _find_jumps(analysis: Analysis) -> tuple[Array, Array, bool]:
     position_changes_m = np.diff(position_m.to_numpy(), axis=0)
     if len(position_changes_m) < MIN_POSITIONS_FOR_JUMPS:
         return time_s[:0], position_changes_m[:0], False
+    # jump_vectors_m[k] is the change to row k + 2, minus the mean of the changes before and after,
+    # which is the motion of the vehicle
     jump_vectors_m = position_changes_m[1:-1] - 0.5 * (
         position_changes_m[:-2] + position_changes_m[2:]
     )
     jump_sizes_m = np.linalg.norm(jump_vectors_m, axis=1)
-    intervals_s = np.diff(time_s)[1:-1]
-    median_interval_s = float(np.median(intervals_s))
+    # Jumps that reset_counter announces; a single one is reported by detect_jumps
     reset_rows = np.searchsorted(time_s, analysis.source.reset_times_s - RESET_TIME_TOLERANCE_S) - 2
     reset_rows = reset_rows[(reset_rows >= 0) & (reset_rows < len(jump_sizes_m))]
     reset_rows = reset_rows[jump_sizes_m[reset_rows] >= MIN_JUMP_M]
     if len(reset_rows) >= MIN_JUMPS_WITH_RESET_COUNTER:
         return time_s[reset_rows + 2], jump_vectors_m[reset_rows], True
+    # Without reset_counter: jumps much larger than the changes near them
+    intervals_s = np.diff(time_s)[1:-1]
+    median_interval_s = float(np.median(intervals_s))
     local_median_change_m = (
         pd.Series(jump_sizes_m).rolling(JUMP_WINDOW_SAMPLES, center=True, min_periods=1).median()
     )
@@ -349,6 +344,8 @@ def _find_jumps(analysis: Analysis) -> tuple[Array, Array, bool]:
     is_jump = (jump_sizes_m > min_jump_sizes_m) & (
         intervals_s < MAX_JUMP_TO_MEDIAN_INTERVAL_RATIO * median_interval_s
     )
+    # The median position also has to jump, after subtraction of the motion of the vehicle: after an
+    # outlier, it does not
     window_size = max(MIN_JUMP_DURATION_SAMPLES, round(MIN_JUMP_DURATION_S / median_interval_s))
     for jump in np.flatnonzero(is_jump):
         row = jump + 2  # the first position after the jump
@@ -388,7 +385,7 @@ def detect_scale_error(analysis: Analysis) -> Findings:
             sigma,
             f"the IMU (± {format_percent(1.96 * sigma)}, 95 %)",
             "Measure a known distance with the source. "
-            f"{find_source_texts(analysis.source).scale_check}. If the distance is right, "
+            f"{find_source_texts(analysis).scale_check}. If the distance is right, "
             "calibrate the accelerometers.",
         )
 
@@ -402,7 +399,7 @@ def make_scale_finding(
     for example "the IMU (± 2 %, 95 %)".
     """
     return finding(
-        "error" if abs(scale_error) >= MIN_SCALE_ERROR_FOR_SEVERITY_ERROR else "warning",
+        error_if(abs(scale_error) >= MIN_SCALE_ERROR_FOR_SEVERITY_ERROR),
         "source_scale_error",
         f"{source.kind_name} distances are {format_percent(abs(scale_error))} too "
         f"{'long' if scale_error > 0.0 else 'short'}. The scale is estimated from {reference}. "
@@ -418,7 +415,8 @@ def detect_outliers(analysis: Analysis) -> Findings:
     if not isinstance(axis_tuning, AxisTuning):
         return
     outlier_time_s, systematic_errors = axis_tuning.outlier_time_s, analysis.systematic_errors
-    for jump in () if isinstance(systematic_errors, Unavailable) else systematic_errors.jumps:
+    jumps = () if isinstance(systematic_errors, Unavailable) else systematic_errors.jumps
+    for jump in jumps:  # detect_jumps reports outliers that belong to a jump
         is_near_jump = (outlier_time_s >= jump.time_s - OUTLIER_BURST_DURATION_S) & (
             outlier_time_s < jump.time_s + OUTLIER_RETEST_DURATION_AFTER_JUMP_S
         )
@@ -427,10 +425,10 @@ def detect_outliers(analysis: Analysis) -> Findings:
     outlier_fraction = outlier_count / axis_tuning.count
     if outlier_fraction < MIN_OUTLIER_FRACTION or outlier_count < MIN_OUTLIERS:
         return
-    source_texts = find_source_texts(analysis.source)
+    source_texts = find_source_texts(analysis)
     outlier_sizes_m, reference = compute_outlier_sizes_m(analysis, outlier_time_s)
     yield finding(
-        "error" if outlier_fraction >= MIN_OUTLIER_FRACTION_FOR_ERROR else "warning",
+        error_if(outlier_fraction >= MIN_OUTLIER_FRACTION_FOR_SEVERITY_ERROR),
         "source_outliers",
         f"{outlier_count} of {axis_tuning.count} {analysis.source.positions_text} "
         f"({format_percent(outlier_fraction, 1)}) are outliers of up to "
@@ -454,23 +452,18 @@ def compute_outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[
 
     The reference is ground truth or, without it, the previous and next positions.
     """
-    axes = select_north_and_east(analysis) or [analysis.main]
-    has_truth = all(isinstance(result.truth, pd.DataFrame) for result in axes)
-    squared_distances_m2 = np.zeros(len(outlier_time_s))
-    for result in axes:
-        time_s, measured_m = result.axis.measurement_time_s, result.axis.measurement_m
-        is_outlier = np.isin(time_s, outlier_time_s)
-        reference_time_s, reference_position_m = time_s[~is_outlier], measured_m[~is_outlier]
-        if has_truth and isinstance(result.truth, pd.DataFrame):
-            true_position_m = result.truth["position_m"].dropna()
-            reference_time_s = true_position_m.index.to_numpy()
-            reference_position_m = true_position_m.to_numpy()
-        expected_position_m = np.interp(outlier_time_s, reference_time_s, reference_position_m)
-        squared_distances_m2 += (
-            np.interp(outlier_time_s, time_s, measured_m) - expected_position_m
-        ) ** 2
-    reference = "ground truth" if has_truth else "the previous and next positions"
-    return np.sqrt(squared_distances_m2), reference
+    reference, distances_m = "the previous and next positions", np.zeros(len(outlier_time_s))
+    for result in select_north_and_east(analysis) or [analysis.main]:
+        measured_m = pd.Series(result.axis.measurement_m, result.axis.measurement_time_s)
+        reference_m = measured_m[~measured_m.index.isin(outlier_time_s)]
+        if isinstance(result.truth, pd.DataFrame):
+            reference, reference_m = "ground truth", result.truth["position_m"].dropna()
+        outlier_m, expected_m = (
+            np.interp(outlier_time_s, position_m.index, position_m)
+            for position_m in (measured_m, reference_m)
+        )
+        distances_m = np.hypot(distances_m, outlier_m - expected_m)
+    return distances_m, reference
 
 
 def _format_rejected_outliers(analysis: Analysis, outlier_time_s: Array) -> str:
@@ -506,22 +499,19 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
     reported_sigma_m = float(np.sqrt(reported_variance_m2.mean(axis=1)).mean())
     variance_ratio = (reported_sigma_m / noise_m) ** 2
     error_factor = max(variance_ratio, 1.0 / variance_ratio)
-    # A reported variance near the mean square error against ground truth is correct
-    rmse_m = _compute_rmse_per_axis_m(analysis) if variance_ratio > 1.0 else None
-    if (
-        (rmse_m is not None and reported_sigma_m**2 < MIN_VARIANCE_ERROR_FACTOR * rmse_m**2)
-        or error_factor < MIN_VARIANCE_ERROR_FACTOR
-        or low <= reported_sigma_m <= high
-    ):
+    if error_factor < MIN_VARIANCE_ERROR_FACTOR or low <= reported_sigma_m <= high:
         return
-    size_word, correlation_note = "small" if variance_ratio < 1.0 else "large", ""
-    if variance_ratio > 1.0 and rmse_m is None:
-        correlation_note = (
-            " The reported σ may include time-correlated errors, which innovations do not show."
-        )
-    severity: Severity = (
-        "error" if error_factor >= MIN_VARIANCE_ERROR_FACTOR_FOR_SEVERITY_ERROR else "warning"
-    )
+    size_word, correlation_note = "small", ""
+    if variance_ratio > 1.0:
+        size_word, rmse_m = "large", _compute_rmse_per_axis_m(analysis)
+        # The estimated noise lacks time-correlated errors; the error against ground truth does not
+        if rmse_m is None:
+            correlation_note = (
+                " The reported σ may include time-correlated errors, which innovations do not show."
+            )
+        elif reported_sigma_m**2 < MIN_VARIANCE_ERROR_FACTOR * rmse_m**2:
+            return
+    severity = error_if(error_factor >= MIN_VARIANCE_ERROR_FACTOR_FOR_SEVERITY_ERROR)
     cause = REPORTED_VARIANCE_USED_BY_EKF2_CAUSE
     effect = "EKF2 uses the larger of reported variance and EKF2_EVP_NOISE² (EKF2_EV_NOISE_MD 0)."
     if analysis.flight.log.parameters.get("EKF2_EV_NOISE_MD") == 1:
@@ -544,16 +534,14 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
 
 
 def _compute_rmse_per_axis_m(analysis: Analysis) -> float | None:
-    mean_squares_m2 = []
-    for result in select_north_and_east(analysis):
-        if isinstance(result.truth, Unavailable):
-            return None
-        true_positions, axis = result.truth["position_m"].dropna(), result.axis
-        true_position_m = np.interp(
-            axis.measurement_time_s, true_positions.index, true_positions, left=np.nan, right=np.nan
+    """Return the position RMSE (m) against ground truth per horizontal axis, if known."""
+    rmses_m = [
+        compute_rmse_to_truth(
+            analysis.flight, axis.measurement_m, axis.direction, axis.measurement_time_s
         )
-        mean_squares_m2.append(np.nanmean((axis.measurement_m - true_position_m) ** 2))
-    return float(np.sqrt(np.mean(mean_squares_m2))) if mean_squares_m2 else None
+        for axis in (result.axis for result in select_north_and_east(analysis))
+    ]
+    return rms(np.array(rmses_m)) if rmses_m and None not in rmses_m else None
 
 
 def compute_motion_range_m(comparison: Comparison) -> float:

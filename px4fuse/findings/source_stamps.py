@@ -13,16 +13,17 @@ from px4fuse.ekf2.intervals import MAX_DELAY_BEHIND_HORIZON_S
 from px4fuse.findings.model import (
     Findings,
     compute_flag_fraction,
+    error_if,
+    finding,
     format_percent,
     make_error,
-    make_note,
     make_warning,
 )
 from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import (
     METHODS_WITHOUT_MEASUREMENT_TIMES,
     REPEATED_TIMESTAMPS_NOTE,
-    ClockMap,
+    ClockConversion,
     Ekf2,
     Unavailable,
 )
@@ -34,9 +35,9 @@ MAX_ARRIVAL_TO_PUBLICATION_DELAY_S = 0.001
 # Minimum latency (s) for a warning; it causes a position error of 2 cm at 1 m/s
 MIN_LATENCY_S = 0.02
 # Minimum latency (s) for severity "error"; it causes a position error of 10 cm at 1 m/s
-MIN_LATENCY_FOR_ERROR_S = 0.10
+MIN_LATENCY_FOR_SEVERITY_ERROR_S = 0.10
 # Minimum rank correlation of latency with time, for a latency that grows in flight
-MIN_LATENCY_CORRELATION = 0.8
+MIN_CORRELATION_OF_LATENCY_WITH_TIME = 0.8
 # Minimum fraction of positions that EKF2 drops because of their latency, for a finding
 MIN_DROPPED_POSITION_FRACTION = 0.02
 # Minimum number of positions before and after TIMESYNC converges, to detect the convergence
@@ -65,7 +66,7 @@ def detect(analysis: Analysis) -> Findings:
     elif clock_map.note == REPEATED_TIMESTAMPS_NOTE and clock_map.distinct_stamps:
         yield from detect_repeated_timestamps(analysis, clock_map.pairs, clock_map.distinct_stamps)
     elif clock_map.clock in EFFECT_BY_UNUSABLE_TIMESTAMP:
-        yield from detect_timestamp_unit(analysis, clock_map.clock)
+        yield from detect_wrong_timestamp_unit_or_clock(analysis, clock_map.clock)
     elif clock_map.distinct_stamps is not None:
         yield from detect_constant_timestamps(positions_text, clock_map, clock_map.distinct_stamps)
     elif clock_map.method in METHODS_WITHOUT_MEASUREMENT_TIMES:
@@ -124,7 +125,7 @@ def detect_repeated_timestamps(
     )
 
 
-def detect_timestamp_unit(analysis: Analysis, clock_name: str) -> Findings:
+def detect_wrong_timestamp_unit_or_clock(analysis: Analysis, clock_name: str) -> Findings:
     """Report timestamps in a wrong unit or from another clock."""
     ekf2, fusion_sentence = analysis.flight.ekf2, ""
     if (
@@ -147,7 +148,7 @@ def detect_timestamp_unit(analysis: Analysis, clock_name: str) -> Findings:
 
 
 def detect_constant_timestamps(
-    positions_text: str, clock_map: ClockMap, distinct_count: int
+    positions_text: str, clock_map: ClockConversion, distinct_count: int
 ) -> Findings:
     yield make_error(
         "source_timestamps_constant",
@@ -177,13 +178,16 @@ def detect_arrival_timestamps(analysis: Analysis) -> Findings:
     timesync_convergence = find_timesync_convergence(analysis)
     if timesync_convergence is not None:
         convergence_time_s, latency_s = timesync_convergence
-        make_finding = make_error if latency_s >= MIN_LATENCY_FOR_ERROR_S else make_warning
-        airborne = analysis.flight.airborne
+        severity, airborne = (
+            error_if(latency_s >= MIN_LATENCY_FOR_SEVERITY_ERROR_S),
+            analysis.flight.airborne,
+        )
         if not isinstance(airborne, Unavailable) and all(
             start >= convergence_time_s for start, _ in airborne
         ):
-            make_finding = make_note
-        yield make_finding(
+            severity = "note"
+        yield finding(
+            severity,
             "source_timestamps_are_arrival_times",
             f"Position timestamps are arrival times until {convergence_time_s:.1f} s, when "
             "TIMESYNC converged (PX4 needs 500 answers). Later timestamps are times of "
@@ -217,10 +221,6 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
         float(age_s.median())
         for age_s in (position_age_s.iloc[:sample_count], position_age_s.iloc[-sample_count:])
     )
-    change_verb = "grows"
-    correlation_with_time = rank_correlation(
-        position_age_s.index.to_numpy(), position_age_s.to_numpy()
-    )
     ekf2, late_drop_sentence, dropped_fraction = analysis.flight.ekf2, "", 0.0
     if isinstance(ekf2, Ekf2) and isinstance(ekf2.horizon_s, float):
         delay_s = 1e-3 * analysis.flight.log.parameters.get(EV_POS.delay, 0.0)
@@ -232,14 +232,19 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
         )
     is_any_dropped = dropped_fraction > MIN_DROPPED_POSITION_FRACTION
     if (
-        final_latency_s - initial_latency_s < MIN_LATENCY_FOR_ERROR_S
-        or correlation_with_time < MIN_LATENCY_CORRELATION
+        final_latency_s - initial_latency_s >= MIN_LATENCY_FOR_SEVERITY_ERROR_S
+        and rank_correlation(position_age_s.index.to_numpy(), position_age_s.to_numpy())
+        >= MIN_CORRELATION_OF_LATENCY_WITH_TIME
     ):
-        if not is_any_dropped or dropped_fraction >= 1.0 - MIN_DROPPED_POSITION_FRACTION:
-            return
+        change_verb = "grows"
+    # If EKF2 drops nearly all positions, the latency is constant and too long, but does not vary
+    elif is_any_dropped and dropped_fraction < 1.0 - MIN_DROPPED_POSITION_FRACTION:
         change_verb = "varies"
         initial_latency_s, final_latency_s = position_age_s.quantile([0.05, 0.95]).tolist()
-    yield (make_error if is_any_dropped else make_warning)(
+    else:
+        return
+    yield finding(
+        error_if(is_any_dropped),
         "source_latency_varies",
         f"The latency of the {analysis.source.positions_text} {change_verb} in flight from "
         f"{initial_latency_s:.2f} s to {final_latency_s:.2f} s (time from measurement to arrival)."
@@ -262,14 +267,14 @@ def find_timesync_convergence(analysis: Analysis) -> tuple[float, float] | None:
     is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_TO_PUBLICATION_DELAY_S).to_numpy()
     # TIMESYNC converged where most earlier and fewest later timestamps are arrival times
     converged_index = int(np.argmax(np.cumsum(np.where(is_arrival_time, 1, -1)))) + 1
-    is_arrival_time_before_timesync, is_arrival_time_after_timesync = np.split(
+    is_arrival_time_in_first_part, is_arrival_time_in_second_part = np.split(
         is_arrival_time, [converged_index]
     )
     if (
         is_arrival_time.mean() >= MIN_FRACTION_OF_EXPECTED_TIMESTAMP_KIND
-        or min(len(is_arrival_time_before_timesync), len(is_arrival_time_after_timesync))
+        or min(len(is_arrival_time_in_first_part), len(is_arrival_time_in_second_part))
         < MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC
-        or min(is_arrival_time_before_timesync.mean(), 1.0 - is_arrival_time_after_timesync.mean())
+        or min(is_arrival_time_in_first_part.mean(), 1.0 - is_arrival_time_in_second_part.mean())
         < MIN_FRACTION_OF_EXPECTED_TIMESTAMP_KIND
     ):
         return None

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 from scipy.interpolate import CubicHermiteSpline
 
 from px4fuse.analysis import Analysis
@@ -84,14 +85,14 @@ INVALID_POSITION_TEXTS: Mapping[str, tuple[str, str, str]] = {
 
 
 def detect(analysis: Analysis) -> Findings:
-    yield from detect_invalid_rows(analysis)
+    yield from detect_invalid_positions(analysis)
     yield from detect_rounding(analysis)
     yield from detect_lever_arm(analysis)
     yield from detect_two_senders(analysis)
     yield from detect_copied_estimate(analysis)
 
 
-def detect_invalid_rows(analysis: Analysis) -> Findings:
+def detect_invalid_positions(analysis: Analysis) -> Findings:
     source, segment = analysis.source, analysis.segment
     invalid_reasons = source.invalid_reasons[segment.start_s : segment.end_s]
     for reason, (name, fault, action) in INVALID_POSITION_TEXTS.items():
@@ -103,21 +104,23 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
         spans = tuple(zip(times_by_span.min().tolist(), times_by_span.max().tolist(), strict=True))
         start_s, end_s = max(spans, key=lambda span: span[1] - span[0])
         total_s = sum(end - start for start, end in spans)
-        error_text, make_finding = "", make_note if reason == "NaN" else make_warning
-        if end_s - start_s > compute_max_interval_s(1.0 / source.compute_rate_hz()):
-            make_finding = make_warning
+        # Single NaN are a usual way to send that a position is unknown
+        is_long = end_s - start_s > compute_max_interval_s(1.0 / source.compute_rate_hz())
+        make_finding = make_note if reason == "NaN" and not is_long else make_warning
+        error_text = ""
+        if is_long:
             # Last position before the span, and first position after it
             valid_times_s = analysis.input_axes[0].measurement_time_s
-            first, last = np.clip(
+            first_row, last_row = np.clip(
                 np.searchsorted(valid_times_s, (start_s, end_s)), 1, len(valid_times_s) - 1
             )
-            gap_span_s = float(valid_times_s[first - 1]), float(valid_times_s[last])
+            gap_span_s = float(valid_times_s[first_row - 1]), float(valid_times_s[last_row])
             error_text = f" {describe_errors_after_gap(analysis, gap_span_s)}"
         yield make_finding(
             name,
             f"{len(time_s)} {source.positions_text} {fault}. Times: {format_spans(spans)} "
             f"({total_s:.1f} s in total). KF does not use these positions.{error_text}",
-            action or f"{find_source_texts(source).data_link_check} at {start_s:.1f} s.",
+            action or f"{find_source_texts(analysis).data_link_check} at {start_s:.1f} s.",
             {
                 "count": len(time_s),
                 "longest_s": end_s - start_s,
@@ -157,13 +160,15 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     lever_arm = estimate_lever_arm(analysis.flight, source)
     if lever_arm is None:
         return
-    sigma_m, imu_position_m = lever_arm.sigma_m, find_imu_position_m(analysis.flight)
-    # + 0.0 replaces -0.0 by 0.0
-    forward_m, right_m = (np.round(lever_arm[:2], 2) + 0.0).tolist()
-    lever_arm_m = np.add(source.lever_arm_m[:2], lever_arm[:2]).round(2) + 0.0
-    change = dict(zip(find_aid(analysis).lever_arm, lever_arm_m.tolist(), strict=False))
-    imu_arm_m = np.subtract(imu_position_m[:2], lever_arm[:2]).round(2) + 0.0
-    imu_position_change = dict(zip(IMU_POSITION_PARAMETERS, imu_arm_m.tolist(), strict=False))
+    imu_position_m, arm_m = find_imu_position_m(analysis.flight), np.array(lever_arm[:2])
+    # Forward and right: error of the lever arm, correct position of the sensor, and correct
+    # position of the IMU if the sensor's is right. + 0.0 replaces -0.0 by 0.0
+    (forward_m, right_m), sensor_arm_m, imu_arm_m = (
+        (position_m.round(2) + 0.0).tolist()
+        for position_m in (arm_m, source.lever_arm_m[:2] + arm_m, imu_position_m[:2] - arm_m)
+    )
+    change = dict(zip(find_aid(analysis).lever_arm, sensor_arm_m, strict=False))
+    imu_position_change = dict(zip(IMU_POSITION_PARAMETERS, imu_arm_m, strict=False))
     rotation_deg = (
         lever_arm.rotation_deg
         + find_convention_faults(convention, analysis.flight, source.frame).rotation_deg
@@ -172,23 +177,23 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
         MIN_ROTATION_DEG, MIN_ROTATION_SIGMAS * lever_arm.rotation_sigma_deg
     ):
         rotation_deg = 0.0
-    sensor_text, action = f"{source.kind_name} sensor", f"Set {format_changes(change)}."
-    error_text = "the position error"
+    # The position of the sensor or that of the IMU is wrong. If replays are possible, they decide
     effect_sentence = _describe_replayed_effect(analysis, change, rotation_deg)
-    # The new lever arm of the sensor hardly reduces EKF2's error against ground truth: test another
-    # position of the IMU
-    if effect_sentence is None:
+    if effect_sentence is not None:
+        sensor_text, error_text = f"{source.kind_name} sensor", "the position error"
+        action = f"Set {format_changes(change)}."
+        if any(imu_position_m) and not has_truth:
+            action += (
+                " If the sensor position parameters are right, the IMU position is wrong: set "
+                f"{format_changes(imu_position_change)} instead."
+            )
+    else:
         effect_sentence = _describe_replayed_effect(analysis, imu_position_change, rotation_deg)
-        sensor_text, action = "IMU", f"Set {format_changes(imu_position_change)}."
-        error_text = "EKF2's position error"
+        if effect_sentence is None:
+            return
+        sensor_text, error_text = "IMU", "EKF2's position error"
+        action = f"Set {format_changes(imu_position_change)}."
         forward_m, right_m = 0.0 - forward_m, 0.0 - right_m
-    elif any(imu_position_m) and not has_truth:
-        action += (
-            " If the sensor position parameters are right, the IMU position is wrong: set "
-            f"{format_changes(imu_position_change)} instead."
-        )
-    if effect_sentence is None:
-        return
     if source.alignment is not None:  # no EKF2 parameter corrects positions of a file
         sensor_text = "sensor"
         action = "Subtract this lever arm, rotated to NED by the attitude, from the positions."
@@ -202,10 +207,10 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
         "source_lever_arm",
         f"{rotation_sentence}The {sensor_text} is mounted {np.hypot(forward_m, right_m):.2f} m "
         f"from the mounting point that EKF2 assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m "
-        f"right (± {1.96 * sigma_m:.2f} m, 95 %). When the vehicle turns, {error_text} changes "
-        f"by up to twice this distance. {effect_sentence}{NO_ESTIMATES_SENTENCE}",
+        f"right (± {1.96 * lever_arm.sigma_m:.2f} m, 95 %). When the vehicle turns, {error_text} "
+        f"changes by up to twice this distance. {effect_sentence}{NO_ESTIMATES_SENTENCE}",
         f"{action} Measure the position of the sensor relative to the IMU.",
-        {"forward_m": forward_m, "right_m": right_m, "sigma_m": sigma_m},
+        {"forward_m": forward_m, "right_m": right_m, "sigma_m": lever_arm.sigma_m},
     )
 
 
@@ -228,6 +233,7 @@ def _describe_replayed_effect(
         return ""
     rmses_m, ekf2_model = [], misalign_positions(ekf2_model, -rotation_deg, 0.0)
     changed_model = ekf2_model
+    # The model does not take the position of the IMU from the parameters: move the IMU instead
     if change.keys() <= {*IMU_POSITION_PARAMETERS}:
         inputs = ekf2_model.inputs
         imu_offset_m = np.array([*change.values(), inputs.imu_offset_m[2]])
@@ -259,20 +265,26 @@ def detect_two_senders(analysis: Analysis) -> Findings:
         return
     time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
     weight = ((time_s[1:-1] - time_s[:-2]) / (time_s[2:] - time_s[:-2]))[:, None]
+    # Deviation of each position from the line through the previous and the next position. With two
+    # senders, it alternates between ± their distance: invert every other deviation
     deviations_m = position_m[1:-1] - (1.0 - weight) * position_m[:-2] - weight * position_m[2:]
     deviations_m[::2] *= -1.0
-    windows_m = deviations_m[: window_count * WINDOW_SAMPLES].reshape(
+    deviation_windows_m = deviations_m[: window_count * WINDOW_SAMPLES].reshape(
         window_count, WINDOW_SAMPLES, -1
     )
-    medians_m = np.median(windows_m, axis=1)
-    largest_median_m = medians_m[np.argmax(np.linalg.norm(medians_m, axis=1))]
-    medians_m[medians_m @ largest_median_m < 0.0] *= -1.0
-    difference_between_senders_m = np.median(medians_m, axis=0)
-    scatter_m = 1.4826 * np.median(np.abs(medians_m - difference_between_senders_m), axis=0).max()
+    window_medians_m = np.median(deviation_windows_m, axis=1)
+    # A lost sample inverts the later medians: give all the direction of the largest
+    largest_median_m = window_medians_m[np.argmax(np.linalg.norm(window_medians_m, axis=1))]
+    window_medians_m[window_medians_m @ largest_median_m < 0.0] *= -1.0
+    difference_between_senders_m = np.median(window_medians_m, axis=0)
+    # σ from the median absolute deviation
+    scatter_m = (
+        1.4826 * np.median(np.abs(window_medians_m - difference_between_senders_m), axis=0).max()
+    )
     distance_m = float(np.linalg.norm(difference_between_senders_m))
     if distance_m < max(MIN_SENDER_DISTANCE_M, MIN_SENDER_DISTANCE_SIGMAS * scatter_m):
         return
-    distance_texts = ", ".join(
+    distances_text = ", ".join(
         f"{abs(part):.2f} m {name.partition('_')[0]}"
         for part, name in zip(difference_between_senders_m, samples.columns, strict=True)
     )
@@ -280,7 +292,7 @@ def detect_two_senders(analysis: Analysis) -> Findings:
         "source_two_senders",
         f"Two systems alternately send positions that differ by {distance_m:.2f} m. After "
         f"subtraction of the vehicle's motion, successive {analysis.source.positions_text} "
-        f"({rate_hz:.3g} Hz in total) differ by {distance_texts}. {NO_ESTIMATES_SENTENCE}",
+        f"({rate_hz:.3g} Hz in total) differ by {distances_text}. {NO_ESTIMATES_SENTENCE}",
         "Send the positions of one system only: stop the second node, bridge or MAVROS plugin.",
         {"distance_m": distance_m, "rate_hz": rate_hz},
     )
@@ -298,9 +310,8 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
         state.index, state[Columns.POSITION], state[Columns.VELOCITY]
     )
 
-    def compute_median_distance_m(delay_s: float, interval: int = 1) -> float:
-        """Return the median distance (m) of every ``interval``-th position from EKF2's position."""
-        positions = samples[::interval]
+    def compute_median_distance_m(positions: pd.DataFrame, delay_s: float) -> float:
+        """Return the median distance (m) of positions from EKF2's position before a delay."""
         time_s = positions.index.to_numpy() - delay_s
         is_moving = (
             np.linalg.norm(ekf2_position_spline(time_s, 1), axis=1)
@@ -313,12 +324,12 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
         return float(np.median(distance_m[is_inside]))
 
     # Some of the positions are sufficient to find the delay
-    interval = max(1, len(samples) // POSITION_COUNT_TO_FIND_DELAY_OF_COPY)
+    some_samples = samples[:: max(1, len(samples) // POSITION_COUNT_TO_FIND_DELAY_OF_COPY)]
     delay_s = min(
         TESTED_DELAYS_OF_COPIED_ESTIMATE_S.tolist(),
-        key=lambda delay_s: compute_median_distance_m(delay_s, interval),
+        key=lambda delay_s: compute_median_distance_m(some_samples, delay_s),
     )
-    distance_m = compute_median_distance_m(delay_s)
+    distance_m = compute_median_distance_m(samples, delay_s)
     fusion_flags = ekf2.fusion_flags
     is_fused = isinstance(fusion_flags, Unavailable) or bool(
         (fusion_flags["horizontal"][segment.start_s : segment.end_s] > 0.0).any()

@@ -136,9 +136,9 @@ def _read_parameters(file_name: str) -> dict[str, Parameter]:
 
 # Parameters of the EKF2 model. PX4 limits neither the maximum of gates nor positions: 1000 SD and
 # 100 m are limits of px4fuse
-PARAMETERS = _read_parameters("model_parameters.csv")
+MODEL_PARAMETERS = _read_parameters("model_parameters.csv")
 # All parameters with a known unit, default and range
-KNOWN_PARAMETERS = PARAMETERS | _read_parameters("logged_parameters.csv")
+KNOWN_PARAMETERS = MODEL_PARAMETERS | _read_parameters("logged_parameters.csv")
 MAGNETIC_FIELD_NOISE_PARAMETERS = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
 # Value of EKF2_MAG_TYPE for "None": EKF2 does not use the magnetometer
 MAG_TYPE_NONE = 5
@@ -150,7 +150,7 @@ DEFAULTS_BEFORE_V1_14: Mapping[str, float] = {EV_POS.delay: 175.0}
 PARAMETERS_IN_RESULTS: tuple[str, ...] = tuple(_PARAMETER_TABLES["reported"].split(","))
 
 
-def fill_with_defaults(
+def fill_parameters_with_defaults(
     logged_values: Mapping[str, float], aid: Aid = EV_POS, *other_aids: Aid
 ) -> dict[str, float]:
     """Return the parameters of EKF2: logged values, or PX4's defaults if not logged.
@@ -171,7 +171,7 @@ def fill_with_defaults(
     }
     defaults = {
         name: parameter.default
-        for name, parameter in PARAMETERS.items()
+        for name, parameter in MODEL_PARAMETERS.items()
         if name not in excluded_names
     }
     if uses_aid_mask(logged_values) and aid == EV_POS:
@@ -227,13 +227,15 @@ def check_parameters(changes: Mapping[str, float]) -> dict[str, float]:
     {'EKF2_EVP_NOISE': 0.2}
     """
     for name, value in changes.items():
-        parameter = PARAMETERS.get(name)
+        parameter = MODEL_PARAMETERS.get(name)
         if parameter is None:
             # EKF2_EV_CTRL is a parameter of PX4 and not a typing error of EKF2_EV_DELAY
-            suggestion = suggest_name(name, PARAMETERS, cutoff=MIN_SIMILARITY_OF_MISTYPED_PARAMETER)
+            suggestion = suggest_name(
+                name, MODEL_PARAMETERS, cutoff=MIN_SIMILARITY_OF_MISTYPED_PARAMETER
+            )
             raise SettingsError(
                 f"The EKF2 replay does not contain {name}, so a change cannot be replayed",
-                f"{suggestion}Choose from {', '.join(PARAMETERS)}.",
+                f"{suggestion}Choose from {', '.join(MODEL_PARAMETERS)}.",
             )
         if fault := parameter.describe_range_error(name, value):
             raise SettingsError(f"{fault} (default {parameter.default:g}).")

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.core.record import (
     Count,
-    NotNegative,
+    NonNegativeFloat,
     Record,
     Sha256,
     Share,
@@ -28,7 +28,7 @@ from px4fuse.core.record import (
     one_line_repr,
 )
 from px4fuse.core.record import Unavailable as Unavailable  # noqa: PLC0414 - public re-export
-from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, PARAMETERS, Aid
+from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, MODEL_PARAMETERS, Aid
 
 PositionKind = Literal["uwb", "vio", "mocap", "gnss", "unknown", "file"]
 PositionRoute = Literal[
@@ -130,7 +130,7 @@ class Dropout(Record):
     """Time span (s) in which the autopilot's logger lost data."""
 
     start_s: float
-    duration_s: NotNegative
+    duration_s: NonNegativeFloat
 
 
 class Sender(Record):
@@ -158,7 +158,7 @@ class Sender(Record):
     chosen: bool
 
 
-class ClockMap(Record):
+class ClockConversion(Record):
     """Linear conversion of a clock to the autopilot's boot clock.
 
     boot time = timestamp + offset + drift · (timestamp - middle of the timestamps)
@@ -175,7 +175,7 @@ class ClockMap(Record):
     # Rate of the boot clock minus rate of this clock
     drift_ppm: float
     # Robust standard deviation of the readings from the fitted line
-    jitter_s: NotNegative
+    jitter_s: NonNegativeFloat
     # Limitation of the conversion, if any
     note: str = ""
     # Number of distinct timestamps, if they are too few for a conversion
@@ -184,14 +184,14 @@ class ClockMap(Record):
 
 def describe_repeated_timestamps(
     clock: str, sample_count: int, distinct_count: int
-) -> ClockMap | None:
+) -> ClockConversion | None:
     """Describe a clock that cannot be converted, because most timestamps are repeated.
 
     Return None if more than half of the timestamps are distinct.
     """
     if 2 * distinct_count > sample_count:
         return None
-    return ClockMap(
+    return ClockConversion(
         clock, "as sent", sample_count, 0.0, 0.0, 0.0, REPEATED_TIMESTAMPS_NOTE, distinct_count
     )
 
@@ -238,7 +238,7 @@ class LogInfo(Record, omit_defaults=False):
     # Boot time of the first sample, which is time zero of the flight
     boot_time_s: float
     # Time span of the data, without outlying timestamps
-    duration_s: NotNegative
+    duration_s: NonNegativeFloat
     dropouts: tuple[Dropout, ...] = ()
     # PX4 parameters for fusion and logging at the start of the log
     parameters: Mapping[str, int | float] = {}
@@ -272,7 +272,7 @@ class LogInfo(Record, omit_defaults=False):
 
     def find_default_value(self, parameter: str) -> float:
         """Return the default of an EKF2 parameter, from the log if possible."""
-        return self.parameter_defaults.get(parameter, PARAMETERS[parameter].default)
+        return self.parameter_defaults.get(parameter, MODEL_PARAMETERS[parameter].default)
 
     @property
     def writes_ulog(self) -> bool:
@@ -360,20 +360,20 @@ class Alignment(Record, kw_only=True):
     frame_reason: str
     # Rotation about the vertical, clockwise from above
     yaw_deg: float
-    yaw_sigma_deg: NotNegative | None = None
+    yaw_sigma_deg: NonNegativeFloat | None = None
     yaw_reason: str
     # Origin of the file in NED
     origin_m: Vector
     # Boot time minus timestamp of the file
     clock_offset_s: float
-    clock_offset_sigma_s: NotNegative | None = None
+    clock_offset_sigma_s: NonNegativeFloat | None = None
     clock_reason: str
     # Reference of the alignment: "EKF2 position", "IMU" or "" (no estimate)
     reference: str
     # Correlation of the aligned positions with the reference
     correlation: float | None = None
     # Horizontal position residual (RMS per axis)
-    residual_rms_m: NotNegative | None = None
+    residual_rms_m: NonNegativeFloat | None = None
     # Sentences about wrong axes, yaw or origin
     misplaced: tuple[str, ...] = ()
     # Sentences about alignment estimates with a large uncertainty
@@ -398,7 +398,7 @@ class PositionTrack:
     topics: tuple[str, ...]
     log: str = ""
     # Conversion of the sender's clock to the boot clock
-    clock_map: ClockMap | None = None
+    clock_map: ClockConversion | None = None
     alignment: Alignment | None = None
     # Quaternion from body FRD to ``frame``, and variances about the body axes
     orientation: pd.DataFrame | None = None
@@ -442,7 +442,7 @@ class PositionTrack:
 
     def compute_rate_hz(self) -> float:
         """Return the sample rate (Hz) without gaps; NaN for fewer than two samples."""
-        return sample_rate(self.samples)
+        return compute_sample_rate_hz(self.samples)
 
     @property
     def kind_name(self) -> str:
@@ -460,7 +460,7 @@ class PositionTrack:
     def reset_times_s(self) -> Array:
         """Times (s) at which the reset counter of the source changes."""
         reset_counter = self.status.get("reset_counter", pd.Series(dtype=float))
-        return np.asarray(reset_counter.index[1:][np.diff(reset_counter) != 0.0], dtype=np.float64)
+        return np.asarray(reset_counter.index[1:][np.diff(reset_counter) != 0.0], np.float64)
 
 
 def estimate_white_noise_m(position_m: Array) -> float:
@@ -480,7 +480,7 @@ def infer_position_kind(samples: pd.DataFrame) -> PositionKind:
     is_uwb = (
         len(position_m) >= MIN_NOISE_SAMPLES
         and estimate_white_noise_m(position_m) > MIN_UWB_NOISE_M
-        and sample_rate(samples) < MAX_UWB_RATE_HZ
+        and compute_sample_rate_hz(samples) < MAX_UWB_RATE_HZ
     )
     return "uwb" if is_uwb else "unknown"
 
@@ -597,7 +597,7 @@ class AidLog:
 def sample_step_function(step_function: pd.Series[float], times: pd.Index[float] | Array) -> Array:
     """Return the values of a step function at the given times."""
     previous_rows = np.clip(np.searchsorted(step_function.index, times, side="right") - 1, 0, None)
-    return np.asarray(step_function, dtype=np.float64)[previous_rows]
+    return np.asarray(step_function, np.float64)[previous_rows]
 
 
 class ParameterChange(NamedTuple):
@@ -701,7 +701,7 @@ class Flight:
     missing: tuple[Unavailable, ...] = ()
     # Topics of each kind of data, for example of "imu" or "ekf2_state"
     streams: Mapping[str, DataSource] = field(default_factory=dict)
-    clocks: tuple[ClockMap, ...] = ()
+    clocks: tuple[ClockConversion, ...] = ()
     # Position data in the log that px4fuse does not use
     unused: tuple[UnusedData, ...] = ()
     # Files read in addition to the log
@@ -746,7 +746,7 @@ def rows_between(samples: pd.DataFrame, start_s: float, end_s: float) -> pd.Data
     return samples.iloc[first_row : int(np.searchsorted(time_s, end_s, side="right"))]
 
 
-def sample_rate(samples: pd.DataFrame) -> float:
+def compute_sample_rate_hz(samples: pd.DataFrame) -> float:
     """Return the sample rate (Hz) without gaps; NaN for fewer than two samples.
 
     It is the inverse of the mean interval, because decimated topics have two different intervals.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 from px4fuse.html.safe import (
-    clean_values,
+    clean_texts,
     compute_csp_hash,
     encode_safe_json,
     load_template,
@@ -186,5 +186,5 @@ def page(
         groups=column_groups,
         rows_name=rows_name,
         full_table_note=full_table_note,
-        content=encode_safe_json(clean_values(page_data)),
+        content=encode_safe_json(clean_texts(page_data)),
     )

@@ -16,10 +16,10 @@ from px4fuse.core.text import clean_text, convert_nested
 MAX_TEXT_LENGTH = 20_000
 
 
-def clean_values(value: Any, max_length: int = MAX_TEXT_LENGTH) -> Any:
+def clean_texts(value: Any, max_length: int = MAX_TEXT_LENGTH) -> Any:
     r"""Clean and shorten all texts in nested dicts and lists.
 
-    >>> clean_values(["a\x1bb", "abcdef", 1.0], 3)
+    >>> clean_texts(["a\x1bb", "abcdef", 1.0], 3)
     ['ab', 'abc…', 1.0]
     """
 
@@ -62,7 +62,7 @@ def load_template(name: str) -> Template:
         loader=PackageLoader("px4fuse", ""),
         autoescape=True,
         trim_blocks=True,
-        finalize=lambda value: clean_values(value) if type(value) is str else value,
+        finalize=lambda value: clean_texts(value) if type(value) is str else value,
         undefined=StrictUndefined,
     )
     return environment.get_template(name)

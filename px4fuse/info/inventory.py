@@ -1,6 +1,6 @@
 """Contents of a log, possible analyses, and logging advice for the next flight."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,7 @@ from px4fuse.comparison.comparison import project_tracks
 from px4fuse.comparison.flight_events import compute_max_interval_s
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.preparation import prepare_comparison_inputs, select_source_innovations
-from px4fuse.core.text import capitalise_first, format_utc_time, to_json_types
+from px4fuse.core.text import capitalise_first_letter, format_utc_time, to_json_types
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.inputs import prepare_inputs
 from px4fuse.errors import MissingDataError, Px4FuseError
@@ -32,9 +32,9 @@ from px4fuse.flight.model import (
     PositionTrack,
     Spans,
     Unavailable,
-    sample_rate,
+    compute_sample_rate_hz,
 )
-from px4fuse.info.tables import NO_POSITION, list_missing_data
+from px4fuse.info.tables import list_missing_data
 from px4fuse.request import ComparisonRequest, replace_argument_names
 
 SCHEMA_NAME = "px4fuse-info"
@@ -150,38 +150,40 @@ class Inventory:
 
 def list_log_contents(flight: Flight) -> Inventory:
     """List the data in a log, the possible analyses and the logging advice."""
-    comparison, reason, missing_position_remedy = None, "", ""
+    log = flight.log
+    notes = [*log.damage]
+    if log.ends_in_flight and not log.damage:
+        notes.append("the log ends in flight and does not contain the landing")
+    notes += log.notes
+    comparison, segment, missing_position_remedy = None, None, ""
     try:
         comparison = prepare_comparison_inputs(
-            flight, ComparisonRequest(log=flight.log.name), keep_positions_as_sent=True
+            flight, ComparisonRequest(log=log.name), keep_positions_as_sent=True
         )
-        reason = comparison.source_reason
     except Px4FuseError as error:
-        reason = replace_argument_names(error.reason).removeprefix(f"{flight.log.name}: ")
+        reason = replace_argument_names(error.reason).removeprefix(f"{log.name}: ")
         missing_position_remedy = replace_argument_names(error.remedy)
         if not isinstance(error, MissingDataError):
+            # The log has too few positions. The advice of the error, other settings of the
+            # analysis, does not help for the next log
             missing_position_remedy = (
                 "Set SDLOG_MODE to 0 (logging from arming) to record the whole flight."
             )
-    if comparison is not None:
+    else:
+        reason, segment = comparison.source_reason, comparison.segment
+        notes += comparison.source.notes
         flight = select_source_innovations(flight, comparison.source)
-    log = flight.log
-    is_landing_missing = log.ends_in_flight and not log.damage
+    if isinstance(flight.ekf2, Ekf2):
+        notes += flight.ekf2.notes
     return Inventory(
         flight=flight,
         start_utc=format_utc_time(log.start_unix_s),
         sources=tuple(_list_logged_data(flight, comparison, reason)),
         source_reason=reason,
-        segment=None if comparison is None else comparison.segment,
+        segment=segment,
         abilities=tuple(_list_analyses(flight, comparison, reason)),
         advice=_collect_logging_advice(flight, comparison, missing_position_remedy),
-        notes=(
-            *log.damage,
-            *["the log ends in flight and does not contain the landing"] * is_landing_missing,
-            *log.notes,
-            *(() if comparison is None else comparison.source.notes),
-            *(flight.ekf2.notes if isinstance(flight.ekf2, Ekf2) else ()),
-        ),
+        notes=tuple(notes),
     )
 
 
@@ -201,8 +203,12 @@ def to_json_dict(inventory: Inventory) -> dict[str, Any]:
 def _list_logged_data(
     flight: Flight, comparison: PreparedComparison | None, reason: str
 ) -> Iterator[LoggedData]:
+    def describe_stream(name: str, data: pd.DataFrame | Spans | Unavailable) -> LoggedData:
+        return _make_logged_data(STREAM_LABELS[name], data, flight.streams.get(name))
+
     ekf2, truth = flight.ekf2, flight.truth
-    yield from _list_streams(flight, {"imu": flight.imu, "attitude": flight.attitude})
+    yield describe_stream("imu", flight.imu)
+    yield describe_stream("attitude", flight.attitude)
     for track in flight.positions:
         yield _make_logged_data(
             "position",
@@ -214,26 +220,20 @@ def _list_logged_data(
         )
     if not flight.positions:
         yield LoggedData("position", unavailable=reason)
-    data_by_stream: dict[str, pd.DataFrame | Spans | Unavailable]
     if isinstance(ekf2, Unavailable):
-        data_by_stream = {"ekf2_state": ekf2}
+        yield describe_stream("ekf2_state", ekf2)
     else:
+        yield describe_stream("ekf2_state", ekf2.state)
+        yield describe_stream("ekf2_variance", ekf2.variance)
         # use the axis with most innovations, because some axes may not be logged
         innovations = max(
             ekf2.innovations.values(),
             key=lambda samples: len(samples) if isinstance(samples, pd.DataFrame) else -1,
         )
-        data_by_stream = {"ekf2_state": ekf2.state, "ekf2_variance": ekf2.variance}
-        data_by_stream |= {"ekf2_innovations": innovations, "ekf2_fusing": ekf2.fusion_flags}
-    data_by_stream["truth"] = truth if isinstance(truth, Unavailable) else truth.samples
-    yield from _list_streams(flight, data_by_stream | {"airborne": flight.airborne})
-
-
-def _list_streams(
-    flight: Flight, data_by_stream: Mapping[str, pd.DataFrame | Spans | Unavailable]
-) -> Iterator[LoggedData]:
-    for name, data in data_by_stream.items():
-        yield _make_logged_data(STREAM_LABELS[name], data, flight.streams.get(name))
+        yield describe_stream("ekf2_innovations", innovations)
+        yield describe_stream("ekf2_fusing", ekf2.fusion_flags)
+    yield describe_stream("truth", truth if isinstance(truth, Unavailable) else truth.samples)
+    yield describe_stream("airborne", flight.airborne)
 
 
 def _make_logged_data(
@@ -251,7 +251,7 @@ def _make_logged_data(
         data_fields["samples"] = len(data)
         times_s = data.index.tolist()
         if len(data) > 1:
-            data_fields["rate_hz"] = sample_rate(data)
+            data_fields["rate_hz"] = compute_sample_rate_hz(data)
             data_fields["gaps"] = _measure_gaps(data, is_imu=data_label == STREAM_LABELS["imu"])
     else:
         times_s = [time_s for span in data for time_s in span]
@@ -266,7 +266,7 @@ def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> GapStatistics:
     limit_s = (
         max(MIN_IMU_GAP_S, MIN_IMU_GAP_INTERVALS * float(np.median(intervals_s)))
         if is_imu
-        else float(compute_max_interval_s(1.0 / sample_rate(samples)))
+        else float(compute_max_interval_s(1.0 / compute_sample_rate_hz(samples)))
     )
     long_intervals_s = intervals_s[intervals_s > limit_s]
     return GapStatistics(
@@ -303,7 +303,7 @@ def _list_analyses(
         yield AnalysisOption("aiding sources of EKF2", False, results_by_aid.reason)
     elif isinstance(ekf2, Ekf2):
         rate_texts = (
-            f"{aid.label}: {sample_rate(samples):.2g} Hz"
+            f"{aid.label}: {compute_sample_rate_hz(samples):.2g} Hz"
             if len(samples := ekf2.aids[name].samples) > 1
             else f"{aid.label}: 1 sample"
             for name, aid in results_by_aid.items()
@@ -347,37 +347,32 @@ def _list_ekf2_and_truth_analyses(
 def _collect_logging_advice(
     flight: Flight, comparison: PreparedComparison | None, missing_position_remedy: str
 ) -> tuple[LoggingAdvice, ...]:
-    """Collect logging advice for the next flight.
+    """Collect logging advice for the next flight: from errors, findings and missing data.
 
     ``missing_position_remedy`` is the advice for a log without positions.
     """
     if flight.log.is_assessed:
         return (LoggingAdvice("None", (DIAGNOSIS_WITHHELD.reason,)),)
     findings = [*recording.detect_lost_data(flight), *recording.detect_backward_clock_jumps(flight)]
-    actions_and_purposes = (
-        [(missing_position_remedy, "position")] if missing_position_remedy else []
-    )
     if comparison is not None:
-        findings += [
-            *recording.detect_source_not_logged(comparison),
-            *ekf2_fusion.detect_unfused_positions(comparison),
-        ]
+        findings += recording.detect_source_not_logged(comparison)
+        findings += ekf2_fusion.detect_unfused_positions(comparison)
         findings += recording.detect_dropouts(comparison)
     findings += imu.detect_low_rates(flight)
-    actions_and_purposes += [
-        (finding.remedy, finding_title(finding.id)) for finding in findings if finding.remedy
+    needed_data: tuple[object, ...] = list_missing_data(flight)
+    if not flight.log.writes_ulog:
+        # A MAVLink recording cannot contain the other data
+        needed_data = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
+    actions_and_purposes = [
+        (missing_position_remedy, "position"),
+        *((finding.remedy, finding_title(finding.id)) for finding in findings),
+        *((data.remedy, data.what) for data in needed_data if isinstance(data, Unavailable)),
     ]
-    # data that a MAVLink recording can contain
-    data_in_mavlink_logs = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
-    actions_and_purposes += [
-        (missing_data.remedy, missing_data.what)
-        for missing_data in list_missing_data(flight)
-        if missing_data is not NO_POSITION
-        and (flight.log.writes_ulog or any(missing_data is data for data in data_in_mavlink_logs))
-    ]
+    # Dictionaries without values instead of sets, to keep the order
     purposes_by_action: dict[str, dict[str, None]] = {}
     for action, purpose in actions_and_purposes:
-        purposes_by_action.setdefault(capitalise_first(action), {})[purpose] = None
+        if action:
+            purposes_by_action.setdefault(capitalise_first_letter(action), {})[purpose] = None
     return tuple(
         LoggingAdvice(action, tuple(purposes)) for action, purposes in purposes_by_action.items()
     )

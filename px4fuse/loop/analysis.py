@@ -11,7 +11,7 @@ from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
 from px4fuse.loop import loop_segment
-from px4fuse.loop.closure import choose_key_frames, compute_default_spacing_m, to_z_down
+from px4fuse.loop.closure import choose_key_frames, compute_default_key_frame_spacing_m, to_z_down
 from px4fuse.loop.corrections import (
     build_pose_graph,
     distribute_closure_error_by_distance,
@@ -89,20 +89,22 @@ def analyse(
     if truth and request.closed_loop and request.landed_at is None:
         final_pose_in_truth = loop_segment.find_final_pose_in_truth(path, truth, segment)
     true_end = _find_true_end(path, request, final_pose_in_truth, segment, is_assessed=is_assessed)
-    closures = []
-    if not isinstance(true_end, Unavailable):
-        closures.append(GivenClosure(segment.start_s, segment.end_s, true_end.sigma_m))
-    for given_closure in request.closures:
-        closure = GivenClosure(
-            convert_to_trajectory_time_s(given_closure.time_1_s),
-            convert_to_trajectory_time_s(given_closure.time_2_s),
-            given_closure.sigma_m,
+    closures = [
+        GivenClosure(
+            convert_to_trajectory_time_s(closure.time_1_s),
+            convert_to_trajectory_time_s(closure.time_2_s),
+            closure.sigma_m,
         )
+        for closure in request.closures
+    ]
+    for closure in closures:
         _require_valid_closure(closure, path)
-        closures.append(closure)
+    if not isinstance(true_end, Unavailable):
+        # The closure between take-off and landing is the first
+        closures.insert(0, GivenClosure(segment.start_s, segment.end_s, true_end.sigma_m))
     key_frame_spacing_m = request.key_frames_m
     if key_frame_spacing_m is None:
-        key_frame_spacing_m = compute_default_spacing_m(path.position_m)
+        key_frame_spacing_m = compute_default_key_frame_spacing_m(path.position_m)
     key_frame_indices, distance_m = _choose_key_frames(path, key_frame_spacing_m)
     graph, node_indices, variance_note = build_pose_graph(
         path, key_frame_indices, closures, true_end, noise
@@ -282,10 +284,10 @@ def analyse_flight_loop(
                     "the analysed time span begins or ends in flight",
                     "Omit --start and --end, or give a loop closure with px4fuse loop --closure.",
                 )
-    odometry = find_odometry(flight)
     try:
         trajectory = trajectory_of(flight, "vio")
     except MissingDataError as error:  # missing odometry, or too few poses
+        odometry = find_odometry(flight)
         reason = odometry.reason if isinstance(odometry, Unavailable) else str(error).rstrip(".")
         return Unavailable(
             "loop closure",
@@ -295,10 +297,12 @@ def analyse_flight_loop(
     segment = loop_segment.choose_loop_segment(flight, trajectory, None, None)
     position_m = trajectory.cut_to_span(segment.start_s, segment.end_s).position_m
     extent_m = compute_extent_m(position_m)
-    end_to_start_distance_m = compute_extent_m(np.vstack([position_m[:1], position_m[-1:]]))
+    # A loop is at least as long as the way to its farthest point and back
+    min_path_length_m = 2.0 * extent_m
+    end_to_start_distance_m = float(np.linalg.norm(position_m[-1] - position_m[0]))
     if (
-        2.0 * extent_m < MIN_FLIGHT_LOOP_PATH_M
-        or end_to_start_distance_m > MAX_END_TO_START_DISTANCE_FRACTION * 2.0 * extent_m
+        min_path_length_m < MIN_FLIGHT_LOOP_PATH_M
+        or end_to_start_distance_m > MAX_END_TO_START_DISTANCE_FRACTION * min_path_length_m
     ):
         return Unavailable(
             "loop closure",

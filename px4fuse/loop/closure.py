@@ -26,7 +26,7 @@ _Z_DOWN_CONVERSIONS: dict[Frame, tuple[str, Frame, str]] = {
     "unknown": ("nwu", "FRD", "the coordinate frame is unknown, so z is assumed to be up"),
 }
 # Default key frame spacing as fraction of the extent of the path
-KEY_FRAME_SPACING_FRACTION = 0.02
+KEY_FRAME_SPACING_TO_EXTENT_RATIO = 0.02
 MIN_KEY_FRAME_SPACING_M = 0.02
 MAX_KEY_FRAME_SPACING_M = 0.5
 
@@ -64,9 +64,9 @@ def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
     return replace(rotated, rotation=rotated.rotation * frame_rotation.inv())
 
 
-def compute_default_spacing_m(position_m: Array) -> float:
+def compute_default_key_frame_spacing_m(position_m: Array) -> float:
     """Return the default key frame spacing (m)."""
-    spacing_m = KEY_FRAME_SPACING_FRACTION * compute_extent_m(position_m)
+    spacing_m = KEY_FRAME_SPACING_TO_EXTENT_RATIO * compute_extent_m(position_m)
     return float(np.clip(spacing_m, MIN_KEY_FRAME_SPACING_M, MAX_KEY_FRAME_SPACING_M))
 
 
@@ -119,7 +119,7 @@ def compute_heading_change_rad(rotation: Rotation) -> float:
     return float(lie.wrap(2.0 * np.arctan2(z, w)))
 
 
-def correct_by_distance(
+def remove_closure_error_by_distance(
     trajectory: Trajectory,
     cumulative_distance_m: Array,
     closure_error_vector_m: Array,

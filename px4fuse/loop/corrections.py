@@ -13,13 +13,13 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.loop.closure import (
     DOWN_DIRECTION,
     compute_heading_change_rad,
-    correct_by_distance,
     distribute_by_distance,
+    remove_closure_error_by_distance,
 )
 from px4fuse.loop.model import (
     LANDING_CLOSURE_SOURCE,
-    Closure,
     CorrectionName,
+    LoopClosure,
     OdometryNoise,
     PathResult,
     TrueFinalPose,
@@ -80,6 +80,9 @@ def compute_odometry_variances(
         f"the odometry drift after 100 m is {noise.position_m:g} m in position and "
         f"{noise.heading_deg:g}° in heading (1 σ, {drift_origin_text})"
     ]
+    used_variance_text = (
+        "the {0} variance of odometry edges is the increase of the logged {0} variance"
+    )
     position_variance_increments_m2 = _compute_variance_increments(
         path.position_variance_m2, node_indices
     )
@@ -88,10 +91,7 @@ def compute_odometry_variances(
             position_variance_increments_m2.mean(axis=1),
             MIN_REPORTED_TO_DEFAULT_VARIANCE_RATIO * translation_variance_m2,
         )
-        variance_texts.append(
-            "the position variance of odometry edges is the increase of the logged position "
-            "variance"
-        )
+        variance_texts.append(used_variance_text.format("position"))
     elif path.position_variance_m2 is not None:
         variance_texts.append(
             "the logged position variances are not used, because they do not increase"
@@ -104,10 +104,7 @@ def compute_odometry_variances(
             rotation_variance_increments_rad2,
             MIN_REPORTED_TO_DEFAULT_VARIANCE_RATIO * rotation_variance_rad2,
         )
-        variance_texts.append(
-            "the orientation variance of odometry edges is the increase of the logged orientation "
-            "variance"
-        )
+        variance_texts.append(used_variance_text.format("orientation"))
     return translation_variance_m2, rotation_variance_rad2, "; ".join(variance_texts)
 
 
@@ -155,6 +152,7 @@ def build_pose_graph(
             key_frame_indices,
             "",
         )
+    # Nodes: key frames, and the poses at both ends of each closure
     closure_times_s = np.array(
         [(closure.time_1_s, closure.time_2_s) for closure in closures]
     ).reshape(-1, 2)
@@ -166,6 +164,7 @@ def build_pose_graph(
     translation_variance_m2, rotation_variance_rad2, variance_note = compute_odometry_variances(
         path, node_indices, noise
     )
+    # Edges: odometry between successive nodes, then closures
     step_indices = np.arange(len(node_indices) - 1)
     first_nodes = np.append(step_indices, closure_nodes[:, 0])
     second_nodes = np.append(step_indices + 1, closure_nodes[:, 1])
@@ -179,28 +178,34 @@ def build_pose_graph(
     measured_translation_m = first_rotation_inverse.apply(
         node_position_m[second_nodes] - node_position_m[first_nodes]
     )
-    landing_edge = len(step_indices)
-    for edge_index, closure in enumerate(closures, start=landing_edge):
+    # A closure states that both poses have the same position; orientations have no information
+    landing_edge_index = len(step_indices)
+    for edge_index, closure in enumerate(closures, start=landing_edge_index):
         measured_translation_m[edge_index] = 0.0
         information[edge_index, range(3), range(3)] = closure.sigma_m**-2
     if not isinstance(true_end, Unavailable):
-        measured_translation_m[landing_edge] = first_rotation_inverse[landing_edge].apply(
-            true_end.displacement_vector_m
-        )
+        measured_translation_m[landing_edge_index] = first_rotation_inverse[
+            landing_edge_index
+        ].apply(true_end.displacement_vector_m)
         if true_end.heading_change_deg is not None:
+            # Rotate the final node about the vertical, so that the edge has the true heading change
             odometry_heading_change_rad = compute_heading_change_rad(
-                second_node_rotation[landing_edge] * node_rotation[first_nodes[landing_edge]].inv()
+                second_node_rotation[landing_edge_index]
+                * node_rotation[first_nodes[landing_edge_index]].inv()
             )
             heading_correction_rad = float(
                 lie.wrap(np.radians(true_end.heading_change_deg) - odometry_heading_change_rad)
             )
-            second_node_rotation[landing_edge] = (
+            second_node_rotation[landing_edge_index] = (
                 Rotation.from_rotvec(heading_correction_rad * DOWN_DIRECTION)
-                * second_node_rotation[landing_edge]
+                * second_node_rotation[landing_edge_index]
             )
-            vertical_direction = second_node_rotation[landing_edge].inv().apply(DOWN_DIRECTION)
+            # Only the rotation about the vertical is known; its axis in the frame of the final pose
+            vertical_direction = (
+                second_node_rotation[landing_edge_index].inv().apply(DOWN_DIRECTION)
+            )
             heading_sigma_rad = np.radians(true_end.sigma_heading_deg or 0.0)
-            information[landing_edge, 3:, 3:] = (
+            information[landing_edge_index, 3:, 3:] = (
                 np.outer(vertical_direction, vertical_direction) / heading_sigma_rad**2
             )
     graph = PoseGraph(
@@ -235,7 +240,7 @@ def distribute_closure_error_by_distance(
     distance_m: Array,
     closure_error_vector_m: Array | Unavailable,
     heading_error_deg: float | Unavailable,
-    closures: tuple[Closure, ...],
+    closures: tuple[LoopClosure, ...],
 ) -> dict[CorrectionName, CorrectionOutcome]:
     """Distribute the loop closure error along the path, in proportion to path length.
 
@@ -252,7 +257,7 @@ def distribute_closure_error_by_distance(
     heading_error_rad = (
         0.0 if isinstance(heading_error_deg, Unavailable) else float(np.radians(heading_error_deg))
     )
-    corrected_path = correct_by_distance(
+    corrected_path = remove_closure_error_by_distance(
         path, distance_m, closure_error_vector_m, heading_error_rad
     )
     return {
@@ -261,7 +266,7 @@ def distribute_closure_error_by_distance(
     }
 
 
-def _explain_gate_rejection(correction_name: str, closure: Closure) -> Unavailable:
+def _explain_gate_rejection(correction_name: str, closure: LoopClosure) -> Unavailable:
     return Unavailable(
         correction_name,
         f"the χ² gate rejects {closure} (squared Mahalanobis distance {closure.d2:.1f}, "
@@ -273,19 +278,23 @@ def _explain_gate_rejection(correction_name: str, closure: Closure) -> Unavailab
 
 def _gate_closures(
     graph: PoseGraph, closures: Sequence[GivenClosure], true_end: TrueFinalPose | Unavailable
-) -> tuple[Closure, ...]:
-    """Test the loop closures against odometry with a χ² test."""
+) -> tuple[LoopClosure, ...]:
+    """Test the loop closures against odometry with a χ² test.
+
+    If ``true_end`` is known, the first closure is between take-off and landing.
+    """
     edge_count = len(graph.first_nodes)
     gate_results = gate_edges(graph, np.arange(edge_count - len(closures), edge_count))
-    tested_closures: list[Closure] = []
+    tested_closures: list[LoopClosure] = []
     for closure, gate_result in zip(closures, gate_results, strict=True):
         error_m = graph.poses[gate_result.second, :3] - graph.poses[gate_result.first, :3]
         source = "given"
-        if not tested_closures and not isinstance(true_end, Unavailable):
+        is_first = not tested_closures
+        if is_first and not isinstance(true_end, Unavailable):
             error_m = error_m - true_end.displacement_vector_m
             source = LANDING_CLOSURE_SOURCE
         tested_closures.append(
-            Closure(
+            LoopClosure(
                 **structs.asdict(closure),
                 source=source,
                 distance_m=float(np.linalg.norm(error_m)),
@@ -305,7 +314,7 @@ def solve_pose_graphs(
     given_closures: Sequence[GivenClosure],
     true_end: TrueFinalPose | Unavailable,
     progress: Progress,
-) -> tuple[dict[CorrectionName, CorrectionOutcome], tuple[Closure, ...]]:
+) -> tuple[dict[CorrectionName, CorrectionOutcome], tuple[LoopClosure, ...]]:
     """Test the loop closures, and optimise the pose graph.
 
     One optimisation uses the accepted closures. The other one is robust and uses all closures.
@@ -352,16 +361,17 @@ def _correct_path(
 ) -> tuple[Trajectory, Solution]:
     """Correct each pose of a path by interpolation of the corrections of the graph nodes.
 
-    Return the corrected path, and ``solution`` unchanged.
+    Return the corrected path with its solution.
     """
     solved_poses = solution.poses
     node_corrections = (
         Rotation.from_quat(solved_poses[:, 3:]) * Rotation.from_quat(graph_poses[:, 3:]).inv()
     )
     time_s, node_time_s = path.time_s, path.time_s[node_indices]
-    # The first and the last pose of the path are nodes
+    # The first and the last pose of the path are nodes; the last pose is after the node before last
     previous_nodes = np.searchsorted(node_time_s[1:-1], time_s, side="right")
-    next_node_weight = np.interp(time_s, node_time_s, np.arange(len(node_time_s))) - previous_nodes
+    node_number = np.interp(time_s, node_time_s, np.arange(len(node_time_s)))
+    next_node_weight = node_number - previous_nodes
     position_corrected_by_previous_node_m, position_corrected_by_next_node_m = (
         solved_poses[node, :3]
         + node_corrections[node].apply(path.position_m - graph_poses[node, :3])
@@ -379,6 +389,8 @@ def score_paths(
     references: tuple[Trajectory, ...],
 ) -> dict[CorrectionName, PathResult | Unavailable]:
     """Compute ATE and RPE of the uncorrected path and of all corrected paths."""
+    # The time offset from the reference is estimated with the uncorrected path, which is scored
+    # first. All corrected paths have the same times, so they use the same offset
     time_offset_by_reference_s: dict[str, float] = {}
 
     def evaluate_path(path: Trajectory, reference: Trajectory) -> Evaluation | Unavailable:

@@ -10,8 +10,8 @@ from px4fuse.core.arrays import Array
 from px4fuse.core.record import (
     NOT_IN_JSON,
     Count,
+    NonNegativeFloat,
     NotInJson,
-    NotNegative,
     OrUnavailable,
     Record,
     Share,
@@ -57,8 +57,8 @@ class TrueFinalPose(Record, kw_only=True):
 
     displacement_m: AxisComponents
     heading_change_deg: float | None = None
-    sigma_m: NotNegative
-    sigma_heading_deg: NotNegative | None = None
+    sigma_m: NonNegativeFloat
+    sigma_heading_deg: NonNegativeFloat | None = None
     source: str
     assumed: bool
 
@@ -75,30 +75,30 @@ class OdometryNoise(Record, omit_defaults=False):
     """
 
     # σ (m) of the position per axis after 100 m, without heading errors
-    position_m: NotNegative = 1.0
+    position_m: NonNegativeFloat = 1.0
     # σ (°) of the heading after 100 m
-    heading_deg: NotNegative = 3.0
+    heading_deg: NonNegativeFloat = 3.0
     # Drift of position (m/√s) and heading (°/√s) over time
-    position_m_per_root_s: NotNegative = 0.01
-    heading_deg_per_root_s: NotNegative = 0.03
+    position_m_per_root_s: NonNegativeFloat = 0.01
+    heading_deg_per_root_s: NonNegativeFloat = 0.03
     # Tilt drift divided by heading drift; small, because gravity corrects the tilt
-    tilt_share: NotNegative = 0.1
+    tilt_share: NonNegativeFloat = 0.1
 
 
-class Closure(Record, kw_only=True):
+class LoopClosure(Record, kw_only=True):
     """Loop closure (two times at one place), with the result of its χ² test."""
 
     # Two times (s) at which the vehicle was at the same place
     time_1_s: float
     time_2_s: float
     # σ (m), per axis, of the assumed displacement between the positions at time_1_s and time_2_s
-    sigma_m: NotNegative
+    sigma_m: NonNegativeFloat
     # "landing": loop closure between take-off and landing; "given": between two times from the user
     source: str
     # Closure error (m) of odometry
-    distance_m: NotNegative
+    distance_m: NonNegativeFloat
     # χ² test: squared Mahalanobis distance, degrees of freedom, p value, and acceptance
-    d2: NotNegative
+    d2: NonNegativeFloat
     degrees_of_freedom: Count
     p: Share
     accepted: bool
@@ -115,11 +115,11 @@ class PathResult(Record, kw_only=True):
     """Path (corrected or not), with ATE and RPE against each reference."""
 
     # Maximum and RMS distance (m) between corrected and uncorrected positions
-    correction_max_m: NotNegative
-    correction_rms_m: NotNegative
+    correction_max_m: NonNegativeFloat
+    correction_rms_m: NonNegativeFloat
     # Results of the pose graph optimisation; None without a pose graph
-    cost_initial: NotNegative | None = None
-    cost: NotNegative | None = None
+    cost_initial: NonNegativeFloat | None = None
+    cost: NonNegativeFloat | None = None
     iterations: Count | None = None
     converged: bool | None = None
     scores: Mapping[str, OrUnavailable[Evaluation]]
@@ -155,18 +155,18 @@ class Loop(Record, kw_only=True):
     part_reason: str
     poses: Count
     key_frames: Count
-    key_frame_spacing_m: NotNegative
-    path_length_m: NotNegative
+    key_frame_spacing_m: NonNegativeFloat
+    path_length_m: NonNegativeFloat
     end_from_start_m: AxisComponents
     heading_change_deg: float | None = None
     true_end: OrUnavailable[TrueFinalPose]
-    closure_error_m: NotNegative | None = None
-    closure_percent: NotNegative | None = None
+    closure_error_m: NonNegativeFloat | None = None
+    closure_percent: NonNegativeFloat | None = None
     closure_error_axes_m: AxisComponents | None = None
     heading_error_deg: float | Unavailable
     is_absolute_track: bool
     odometry_noise: OdometryNoise
-    closures: tuple[Closure, ...]
+    closures: tuple[LoopClosure, ...]
     corrections: Mapping[CorrectionName, OrUnavailable[PathResult]]
     notes: tuple[str, ...]
     distance_m: NotInJson[Array] = NOT_IN_JSON

@@ -191,7 +191,7 @@ def is_g2o(path: Path) -> bool:
     )
 
 
-def read_source(
+def read_trajectory_source(
     argument: str,
     *,
     default_track: TrackName | None = None,

@@ -19,7 +19,7 @@ from mcp.server.mcpserver.resources import FunctionResource
 from mcp.types import CallToolResult, TextContent, Tool
 
 from px4fuse.core.record import read_toml
-from px4fuse.core.text import one_line
+from px4fuse.core.text import shorten_to_line
 from px4fuse.core.workers import JobFailure, poll_with_limits
 from px4fuse.errors import Px4FuseError
 from px4fuse.findings.model import FINDING_TITLES
@@ -43,7 +43,7 @@ GLOSSARY_FOLDERS = (Path(__file__).parent, Path(__file__).parents[2] / "docs")
 # Terminal output of a command, and results of the command or None
 CommandOutput = tuple[str, Any]
 # Function that converts the arguments of a tool to a command line without ``px4fuse``
-ParseArguments = Callable[[Mapping[str, Any]], list[str]]
+ToolArgumentParser = Callable[[Mapping[str, Any]], list[str]]
 
 
 # Title and text of each prompt, by name
@@ -67,7 +67,7 @@ class Server(MCPServer[Any]):
 
     def __init__(
         self,
-        tools: Sequence[tuple[Tool, ParseArguments]],
+        tools: Sequence[tuple[Tool, ToolArgumentParser]],
         run_command: Callable[[Connection | None, Sequence[str]], CommandOutput],
         timeout_s: float,
         max_memory_bytes: int,
@@ -115,10 +115,10 @@ class Server(MCPServer[Any]):
                 text, results = self._run_command(None, command_words)
             else:
                 async with self._one_at_a_time:
-                    text, results = await self._analyse(command_words, context)
+                    text, results = await self._run_analysis_command(command_words, context)
         except jsonschema.ValidationError as error:
             argument_path = error.json_path.replace("$", name, 1)
-            raise ToolError(f"{argument_path}: {one_line(error.message, 300)}.") from error
+            raise ToolError(f"{argument_path}: {shorten_to_line(error.message, 300)}.") from error
         except (Px4FuseError, OSError) as error:
             raise ToolError(str(error)) from error
         return CallToolResult(
@@ -126,7 +126,7 @@ class Server(MCPServer[Any]):
             structured_content=results,
         )
 
-    async def _analyse(self, command_words: list[str], context: Any) -> CommandOutput:
+    async def _run_analysis_command(self, command_words: list[str], context: Any) -> CommandOutput:
         receiver, sender = Pipe(duplex=False)
         job_results = poll_with_limits(
             partial(self._run_command, sender), [command_words], 1, *self._limits, max_wait_s=0.0

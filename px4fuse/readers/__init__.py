@@ -42,13 +42,13 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
 
         return read_ulog(name, read_log_bytes(path))
     refuse_foreign_format(path, first_bytes, LogError)
-    text_suffix = path.suffix.lower() if first_bytes.isascii() else ""
-    if text_suffix in (".csv", ".tsv", ".jsonl"):
+    text_file_suffix = path.suffix.lower() if first_bytes.isascii() else ""
+    if text_file_suffix in (".csv", ".tsv", ".jsonl"):
         raise LogError(
             f"{name}: the file is a table, not a flight log",
             f"If the table contains positions, use px4fuse compare LOG --position {name}.",
         )
-    if text_suffix in (".tum", ".g2o"):
+    if text_file_suffix in (".tum", ".g2o"):
         raise LogError(
             f"{name}: the file is a trajectory or pose graph, not a flight log",
             f"Use px4fuse evaluate or px4fuse loop {name}.",

@@ -44,7 +44,7 @@ MIN_QUATERNION_NORM = 0.5
 
 
 @dataclass(frozen=True)
-class Layout:
+class MessageLayout:
     """Fields of a PX4 topic or MAVLink message, and the DataFrame columns that they become."""
 
     # PX4 topic or MAVLink message
@@ -59,7 +59,7 @@ class Layout:
     is_step_function: bool = False
 
 
-def expand_layouts(toml_tables: Mapping[str, Any]) -> dict[str, Layout]:
+def expand_layouts(toml_tables: Mapping[str, Any]) -> dict[str, MessageLayout]:
     """Convert TOML tables to definitions with one message field per column.
 
     By default, the topic or message is the name of the table.
@@ -72,7 +72,7 @@ def expand_layouts(toml_tables: Mapping[str, Any]) -> dict[str, Layout]:
             optional_columns=assign_fields_to_columns(layout.optional_columns),
             scale=assign_fields_to_columns(layout.scale),
         )
-        for name, layout in msgspec.convert(rows, dict[str, Layout]).items()
+        for name, layout in msgspec.convert(rows, dict[str, MessageLayout]).items()
     }
 
 
@@ -119,12 +119,15 @@ def collect_unavailable(*flight_data: object) -> tuple[Unavailable, ...]:
     return tuple(data for data in flight_data if isinstance(data, Unavailable))
 
 
-def find_flight_spans(landed_flags: pd.Series, duration_s: float) -> Spans:
-    """Return start and end (s) of each flight, from the flags of the land detector."""
-    landed_changes = landed_flags[landed_flags.ne(landed_flags.shift())]
-    start_times_s = np.maximum.accumulate(np.maximum(landed_changes.index.to_numpy(), 0.0)).tolist()
-    spans = zip(start_times_s, [*start_times_s[1:], duration_s], landed_changes, strict=False)
-    return tuple((start, end) for start, end, is_landed in spans if end > start and not is_landed)
+def find_spans(flags: pd.Series, duration_s: float) -> Spans:
+    """Return start and end (s) of each span in which a flag is set, up to the end of the data.
+
+    Each value of the flag is valid until the next value. Times before 0 are replaced by 0.
+    """
+    changes = flags[flags.ne(flags.shift())]
+    start_times_s = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0)).tolist()
+    spans = zip(start_times_s, [*start_times_s[1:], duration_s], changes, strict=False)
+    return tuple((start, end) for start, end, is_set in spans if is_set and end > start)
 
 
 def ends_in_flight(airborne: Spans | Unavailable, duration_s: float) -> bool:
@@ -163,14 +166,12 @@ def classify_invalid_positions(samples: pd.DataFrame, columns: list[str]) -> "pd
     is_number: BoolArray = (np.abs(values) < MAX_VALID_SI_VALUE).all(axis=1)
     reason_by_row[~is_number] = "NaN"
     is_zero: BoolArray = (values == 0.0).all(axis=1)
-    nonzero_rows, zero_rows = np.flatnonzero(is_number & ~is_zero), np.flatnonzero(is_zero)
-    if len(nonzero_rows):
-        next_index = np.searchsorted(nonzero_rows, zero_rows)
-        neighbour_rows = nonzero_rows[
-            np.clip([next_index - 1, next_index], 0, len(nonzero_rows) - 1)
-        ]
-        distance_m = np.linalg.norm(values[neighbour_rows], axis=2).min(axis=0)
-        reason_by_row.iloc[zero_rows[distance_m > MIN_DISTANCE_OF_INVALID_ZERO_POSITION_M]] = "zero"
+    # Distance of 0, 0, 0 from the previous and from the next position
+    positions = pd.DataFrame(np.where((is_number & ~is_zero)[:, None], values, np.nan))
+    previous_distance_m = np.linalg.norm(positions.ffill(), axis=1)
+    next_distance_m = np.linalg.norm(positions.bfill(), axis=1)
+    distance_m = np.fmin(previous_distance_m, next_distance_m)
+    reason_by_row[is_zero & (distance_m > MIN_DISTANCE_OF_INVALID_ZERO_POSITION_M)] = "zero"
     valid_rows = np.flatnonzero(reason_by_row == "")
     if len(valid_rows):
         offset_from_median_m = values[valid_rows] - np.median(values[valid_rows], axis=0)
@@ -218,10 +219,10 @@ def estimate_quantisation_step(values: Array) -> float:
 
 def interpolate_inside_time_span(time_s: pd.Index | Array, values: "pd.Series[float]") -> Array:
     """Interpolate a time series at the given times; NaN outside its time span."""
-    return np.asarray(np.interp(time_s, values.index, values, left=np.nan, right=np.nan))
+    return np.asarray(np.interp(time_s, values.index, values, np.nan, np.nan))
 
 
-def join_nearest(
+def join_nearest_samples(
     samples: pd.DataFrame, other_samples: pd.DataFrame, tolerance_s: float
 ) -> pd.DataFrame:
     """Join each sample with the sample of ``other_samples`` that is nearest in time.

@@ -12,7 +12,7 @@ from px4fuse.flight.ekf2_parameters import (
     EV_POS,
     GNSS_POS,
     PARAMETERS_IN_RESULTS,
-    fill_with_defaults,
+    fill_parameters_with_defaults,
     replace_invalid_parameters,
 )
 from px4fuse.flight.model import (
@@ -83,7 +83,7 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
     frames = read_frames(name, content)
     address, autopilot = senders.choose_autopilot(frames, system_id)
     recording = read_recording(frames, address, autopilot)
-    clock_mappings = senders.map_sender_clocks(recording)
+    clock_conversions = senders.map_sender_clocks(recording)
     parameters, replaced_parameter_notes = replace_invalid_parameters(_read_parameters(recording))
     imu = _read_imu(recording)
     attitude = _read_attitude(recording)
@@ -91,8 +91,8 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
     # Only PX4 has a parameter for the delay of GNSS
     gnss_delay_s = 0.0
     if autopilot == "PX4":
-        gnss_delay_s = 1e-3 * fill_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay]
-    positions, unavailable_positions = read_positions(recording, clock_mappings, gnss_delay_s)
+        gnss_delay_s = 1e-3 * fill_parameters_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay]
+    positions, unavailable_positions = read_positions(recording, clock_conversions, gnss_delay_s)
     truth = read_truth(recording, positions)
     airborne_spans_s = _read_airborne_spans(recording)
     is_in_flight = common.ends_in_flight(airborne_spans_s, recording.duration_s)
@@ -109,7 +109,7 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
         barometer=barometer(compute_pressure_altitude_m(pressure_hpa)),
         missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *unavailable_positions),
         streams=recording.data_source_by_kind,
-        clocks=senders.describe_clock_conversions(recording, clock_mappings),
+        clocks=senders.describe_clock_conversions(recording, clock_conversions),
         unused=tuple(
             UnusedData(name, count, reason)
             for name, reason in REASON_BY_UNUSED_MESSAGE.items()
@@ -122,11 +122,12 @@ def _read_imu(recording: Recording) -> TableOrUnavailable:
     # HIGHRES_IMU is preferred, because it has SI units and µs timestamps
     layout = HIGHRES_IMU_LAYOUT
     if len(recording.rows(layout.topic)) < 2:
-        layout = recording.find_most_frequent(IMU_LAYOUTS)
+        layout = recording.find_most_frequent_layout(IMU_LAYOUTS)
     rows = recording.rows(layout.topic)
     if layout == HIGHRES_IMU_LAYOUT:
-        imu_ids = np.array(recording.frames.table(layout.topic, rows)["id"])
-        rows = rows[np.isin(imu_ids, pd.Series(imu_ids).mode()[:1])]
+        imu_ids = recording.frames.table(layout.topic, rows)["id"]
+        most_frequent_id = np.bincount(imu_ids, minlength=1).argmax()
+        rows = rows[imu_ids == most_frequent_id]
     imu = recording.read(layout, rows)
     imu = common.select_valid_rows(imu, imu.columns.tolist(), common.MAX_IMU_READING)
     if len(imu) < 2:
@@ -140,7 +141,7 @@ def _read_imu(recording: Recording) -> TableOrUnavailable:
 
 
 def _read_attitude(recording: Recording) -> TableOrUnavailable:
-    layout = recording.find_most_frequent(ATTITUDE_LAYOUTS)
+    layout = recording.find_most_frequent_layout(ATTITUDE_LAYOUTS)
     attitude = common.select_rows_with_attitude(recording.read(layout))[Columns.QUATERNION]
     if len(attitude) < 2:
         names = " or ".join(layout.topic for layout in ATTITUDE_LAYOUTS)
@@ -211,7 +212,7 @@ def _read_ekf2(recording: Recording, parameters: Mapping[str, float]) -> Ekf2 | 
         ),
         resets=(),
         primary_instances=NO_INSTANCE_SWITCHES,
-        gate=fill_with_defaults(parameters)[EV_POS.gate],
+        gate=fill_parameters_with_defaults(parameters)[EV_POS.gate],
         notes=tuple(notes),
         record=ARDUPILOT_REPLAY_UNAVAILABLE if autopilot == "ArduPilot" else RECORD_NOT_LOGGED,
     )
@@ -223,10 +224,7 @@ def _compute_variance_from_accuracy(recording: Recording) -> pd.DataFrame:
     PX4's horizontal accuracy is √(σ_north² + σ_east²) (``get_ekf_lpos_accuracy``).
     """
     accuracy = recording.read(MESSAGE_LAYOUTS["ESTIMATOR_STATUS"])
-    horizontal_variance_m2 = accuracy["horizontal_m"] ** 2 / 2.0
-    variance = pd.concat(
-        [horizontal_variance_m2, horizontal_variance_m2, accuracy["vertical_m"] ** 2], axis=1
-    )
+    variance = accuracy[["horizontal_m", "horizontal_m", "vertical_m"]] ** 2 / [2.0, 2.0, 1.0]
     variance = variance[(variance > 0.0).all(axis=1)].set_axis(Columns.POSITION_VARIANCE, axis=1)
     return variance.reindex(columns=VARIANCE_COLUMNS)
 
@@ -243,8 +241,8 @@ def _read_airborne_spans(recording: Recording) -> Spans | Unavailable:
     recording.record_stream("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK_TEXT)
     rows = recording.rows("EXTENDED_SYS_STATE")[is_known]
     time_s = recording.compute_receipt_boot_times_s(rows) - recording.time_origin_s
-    is_landed = pd.Series(landed_states[is_known] == ON_GROUND_STATE, time_s)
-    return common.find_flight_spans(is_landed, recording.duration_s)
+    is_airborne = pd.Series(landed_states[is_known] != ON_GROUND_STATE, time_s)
+    return common.find_spans(is_airborne, recording.duration_s)
 
 
 def _read_parameters(recording: Recording) -> dict[str, float]:
@@ -338,5 +336,7 @@ def _estimate_start_unix_s(recording: Recording) -> float | None:
         return float(boot_to_unix_fit.at(recording.time_origin_s))
     if receive_times_us is None or not recording.receive_to_boot_time_fit.reading_pair_count:
         return None
-    receipt_s = recording.receive_to_boot_time_fit.inverse().at(recording.time_origin_s)
-    return float(receive_times_us[0] * 1e-6 + receipt_s)
+    receive_time_of_origin_s = recording.receive_to_boot_time_fit.inverse().at(
+        recording.time_origin_s
+    )
+    return float(receive_times_us[0] * 1e-6 + receive_time_of_origin_s)

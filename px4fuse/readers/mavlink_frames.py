@@ -6,7 +6,7 @@ Sources: MAVLink developer guide, "Packet Serialization"; pymavlink's generated 
 """
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -26,6 +26,10 @@ MavlinkAddress = tuple[int, int]
 
 MAGIC_BYTE_V1, MAGIC_BYTE_V2 = 0xFE, 0xFD
 HEADER_BYTES_V1, HEADER_BYTES_V2 = 6, 10
+# Offsets (bytes) in the header. Sequence number, system id and component id are consecutive bytes
+LENGTH_OFFSET, FLAGS_OFFSET_V2 = 1, 2
+SEQUENCE_OFFSET_V1, SEQUENCE_OFFSET_V2 = 2, 4
+MESSAGE_ID_OFFSET_V1, MESSAGE_ID_OFFSET_V2 = 5, 7
 CHECKSUM_BYTES = 2
 SIGNATURE_BYTES = 13
 SIGNED_FLAG = 0x01
@@ -48,13 +52,12 @@ VEHICLE_TYPES = {
     number: entry.name.removeprefix("MAV_TYPE_").replace("_", " ").lower()
     for number, entry in dialect.enums["MAV_TYPE"].items()
 } | {6: "ground station", 18: "companion computer"}
-# CRC_EXTRA byte of the checksum by message id; -1 for unknown messages
-_CRC_EXTRA = np.full(
-    max(1 << 16, *(number + 1 for number in dialect.mavlink_map)), -1, dtype=np.int16
-)
+# CRC_EXTRA byte of the checksum by message id; -1 for unknown messages. All known ids have 16 bits.
+# The last element is for all ids with 24 bits
+_CRC_EXTRA = np.full((1 << 16) + 1, -1, np.int16)
 _CRC_EXTRA[[*dialect.mavlink_map]] = [message.crc_extra for message in dialect.mavlink_map.values()]
 # CRC of each byte value
-_CRC_TABLE = np.array([mcrf4xx(bytes([byte]), 0) for byte in range(256)], dtype=np.uint16)
+_CRC_TABLE = np.array([mcrf4xx(bytes([byte]), 0) for byte in range(256)], np.uint16)
 
 
 @dataclass(frozen=True)
@@ -104,8 +107,8 @@ class MavlinkFrames:
         omits trailing zero bytes of the payload. They are added again.
         """
         layout = wire_layout(MESSAGE_IDS[message])
-        payload = np.zeros((len(rows), layout.itemsize), dtype=np.uint8)
-        content_bytes = np.frombuffer(self.content, dtype=np.uint8)
+        payload = np.zeros((len(rows), layout.itemsize), np.uint8)
+        content_bytes = np.frombuffer(self.content, np.uint8)
         payload_starts = self.payload_offsets[rows]
         payload_lengths = self.payload_lengths[rows]
         for length in np.unique(payload_lengths).tolist():
@@ -165,10 +168,11 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
     receive_time_size_bytes = (
         RECEIVE_TIME_BYTES if _has_receive_times(start_offsets, end_offsets) else 0
     )
-    content_bytes = np.frombuffer(content, dtype=np.uint8)
+    content_bytes = np.frombuffer(content, np.uint8)
     is_version_2 = content_bytes[start_offsets] == MAGIC_BYTE_V2
-    # Sequence number, system id and component id are consecutive bytes
-    sequence_offsets = start_offsets + np.where(is_version_2, 4, 2)
+    sequence_offsets = start_offsets + np.where(
+        is_version_2, SEQUENCE_OFFSET_V2, SEQUENCE_OFFSET_V1
+    )
     unknown_frame_count, byte_count_outside_frames, is_last_frame_incomplete = (
         _count_bytes_outside_frames(
             content, start_offsets - receive_time_size_bytes, end_offsets, receive_time_size_bytes
@@ -184,7 +188,7 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
         component_ids=content_bytes[sequence_offsets + 2],
         sequence_numbers=content_bytes[sequence_offsets],
         payload_offsets=start_offsets + np.where(is_version_2, HEADER_BYTES_V2, HEADER_BYTES_V1),
-        payload_lengths=content_bytes[start_offsets + 1],
+        payload_lengths=content_bytes[start_offsets + LENGTH_OFFSET],
         receive_times_us=_read_receive_times(content_bytes, start_offsets, end_offsets)
         if receive_time_size_bytes
         else None,
@@ -196,81 +200,76 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
 
 def _find_valid_frames(content: bytes) -> Int64Array:
     """Return start, end and message id of each frame with a valid checksum, shape (n, 3)."""
-    content_bytes = np.frombuffer(content, dtype=np.uint8)
+    content_bytes = np.frombuffer(content, np.uint8)
     content_view = memoryview(content)
-    valid_frames = [np.zeros((0, 3), dtype=np.int64)]
-    for block_start in range(0, len(content_bytes), BLOCK_BYTES):
-        possible_frames, crc_end = _find_possible_frames(content_bytes, block_start)
-        byte_ranges = zip((possible_frames[:, 0] + 1).tolist(), crc_end.tolist(), strict=True)
+    valid_frames = []
+    for block_start in range(0, len(content) + 1, BLOCK_BYTES):
+        frames = _find_possible_frames(content, block_start)
+        start_offsets, _, message_ids, crc_offsets = frames.T
+        # The CRC is that of the frame without magic byte, followed by the CRC_EXTRA byte
+        byte_ranges = zip((start_offsets + 1).tolist(), crc_offsets.tolist(), strict=True)
         crc = np.array(
             [mcrf4xx(content_view[first_byte:end_byte]) for first_byte, end_byte in byte_ranges],
-            dtype=np.uint16,
+            np.uint16,
         )
-        crc = (crc >> 8) ^ _CRC_TABLE[
-            (crc ^ _CRC_EXTRA[possible_frames[:, 2]].astype(np.uint16)) & 0xFF
-        ]
-        stored_crc = content_bytes[crc_end] | content_bytes[crc_end + 1].astype(np.uint16) << 8
-        valid_frames.append(possible_frames[stored_crc == crc])
+        crc = (crc >> 8) ^ _CRC_TABLE[(crc ^ _CRC_EXTRA[message_ids]) & 0xFF]
+        stored_crc = content_bytes[crc_offsets] | content_bytes[crc_offsets + 1].astype(int) << 8
+        valid_frames.append(frames[stored_crc == crc, :3])
     return np.concatenate(valid_frames)
 
 
 def _remove_nested_frames(frames: Int64Array) -> Int64Array:
     """Remove frames inside other frames, such as in the payload of the message TUNNEL."""
-    if not np.any(frames[1:, 0] < frames[:-1, 1]):
+    start_offsets, end_offsets, _ = frames.T
+    if np.all(start_offsets[1:] >= end_offsets[:-1]):
         return frames
-    start_offsets = frames[:, 0].tolist()
-    end_offsets = frames[:, 1].tolist()
+    all_frame_starts = {*start_offsets.tolist()}
     kept_rows = []
     previous_end = 0
-    all_frame_starts = {*start_offsets}
-    for row, frame_start in enumerate(start_offsets):
+    for row, (frame_start, frame_end, _) in enumerate(frames.tolist()):
+        # The next frame begins at the end of the previous frame, or after its own receive time
         expected_frame_starts = previous_end, previous_end + RECEIVE_TIME_BYTES
-        if frame_start >= previous_end and (
-            frame_start in expected_frame_starts
-            or all_frame_starts.isdisjoint(expected_frame_starts)
+        # Frames after skipped bytes are valid, but a frame that seems to begin inside the receive
+        # time of the next frame is accidental
+        if frame_start in expected_frame_starts or (
+            frame_start >= previous_end and all_frame_starts.isdisjoint(expected_frame_starts)
         ):
             kept_rows.append(row)
-            previous_end = end_offsets[row]
+            previous_end = frame_end
     return frames[kept_rows]
 
 
-def _find_possible_frames(
-    content_bytes: ByteArray, block_start: int
-) -> tuple[Int64Array, Int64Array]:
+def _find_possible_frames(content: bytes, block_start: int) -> Int64Array:
     """Find possible frames that begin in one block of the file, without a test of the checksum.
 
-    Return start, end and message id of each frame, shape (n, 3), and the checksum offset.
+    Return start, end, message id and checksum offset of each frame, shape (n, 4).
     """
-    block = content_bytes[block_start : block_start + BLOCK_BYTES]
-    start_offsets = block_start + np.flatnonzero(
-        (block == MAGIC_BYTE_V1) | (block == MAGIC_BYTE_V2)
+    # Zeros after the end of the file complete its last headers
+    byte_count = BLOCK_BYTES + HEADER_BYTES_V2 - 1
+    block = content[block_start : block_start + byte_count].ljust(byte_count, b"\0")
+    headers = np.lib.stride_tricks.sliding_window_view(
+        np.frombuffer(block, np.uint8), HEADER_BYTES_V2
     )
-    header_sizes_bytes = np.where(
-        content_bytes[start_offsets] == MAGIC_BYTE_V2, HEADER_BYTES_V2, HEADER_BYTES_V1
+    rows = np.flatnonzero((headers[:, 0] == MAGIC_BYTE_V1) | (headers[:, 0] == MAGIC_BYTE_V2))
+    headers = headers[rows].astype(np.int32)
+    is_version_2 = headers[:, 0] == MAGIC_BYTE_V2
+    low_byte, middle_byte, high_byte = headers[:, MESSAGE_ID_OFFSET_V2:].T
+    message_ids = np.where(
+        is_version_2,
+        low_byte | middle_byte << 8 | high_byte << 16,
+        headers[:, MESSAGE_ID_OFFSET_V1],
+    ).clip(max=len(_CRC_EXTRA) - 1)
+    flags = np.where(is_version_2, headers[:, FLAGS_OFFSET_V2], 0)
+    start_offsets = block_start + rows
+    header_bytes = np.where(is_version_2, HEADER_BYTES_V2, HEADER_BYTES_V1)
+    crc_offsets = start_offsets + header_bytes + headers[:, LENGTH_OFFSET]
+    end_offsets = crc_offsets + CHECKSUM_BYTES + SIGNATURE_BYTES * flags
+    # Frames with other flags have an unknown format
+    is_possible = (
+        (flags <= SIGNED_FLAG) & (_CRC_EXTRA[message_ids] >= 0) & (end_offsets <= len(content))
     )
-    has_whole_header = start_offsets + header_sizes_bytes + CHECKSUM_BYTES <= len(content_bytes)
-    start_offsets = start_offsets[has_whole_header]
-    header_sizes_bytes = header_sizes_bytes[has_whole_header]
-    is_version_2 = header_sizes_bytes == HEADER_BYTES_V2
-    start_offsets_v2 = start_offsets[is_version_2]
-    message_ids = content_bytes[start_offsets + 5].astype(np.int64)
-    message_ids[is_version_2] = (
-        content_bytes[start_offsets_v2 + 7]
-        | content_bytes[start_offsets_v2 + 8].astype(np.int64) << 8
-    )
-    is_candidate = _CRC_EXTRA[message_ids] >= 0
-    is_candidate[is_version_2] &= (content_bytes[start_offsets_v2 + 9] == 0) & (
-        content_bytes[start_offsets_v2 + 2] <= SIGNED_FLAG
-    )
-    crc_end = start_offsets + content_bytes[start_offsets + 1] + header_sizes_bytes
-    end_offsets = crc_end + CHECKSUM_BYTES
-    end_offsets[is_version_2] += SIGNATURE_BYTES * (
-        content_bytes[start_offsets_v2 + 2] & SIGNED_FLAG
-    ).astype(np.int64)
-    is_candidate &= end_offsets <= len(content_bytes)
-    return np.stack([start_offsets, end_offsets, message_ids], axis=1)[is_candidate], crc_end[
-        is_candidate
-    ]
+    frames = np.stack([start_offsets, end_offsets, message_ids, crc_offsets], axis=1)
+    return np.asarray(frames[is_possible])
 
 
 def _has_receive_times(start_offsets: Int64Array, end_offsets: Int64Array) -> bool:
@@ -290,58 +289,56 @@ def _count_bytes_outside_frames(
     ``start_offsets`` and ``end_offsets`` are those of the frames with known messages. The third
     value is True if the file ends within a frame.
     """
-    unknown_frame_count = 0
-    byte_count_outside_frames = 0
-    bytes_after_last_frame = b""
-    gap_start_offsets = np.append(0, end_offsets)
-    gap_end_offsets = np.append(start_offsets, len(content))
-    for gap_start, gap_end in np.column_stack([gap_start_offsets, gap_end_offsets])[
-        gap_start_offsets < gap_end_offsets
-    ].tolist():
+    unknown_frame_count = byte_count_outside_frames = offset = 0
+    gap_starts = np.append(0, end_offsets)
+    gap_ends = np.append(start_offsets, len(content))
+    is_gap = gap_starts < gap_ends
+    is_gap[-1] = True  # the bytes after the last frame, if any
+    for gap_start, gap_end in zip(
+        gap_starts[is_gap].tolist(), gap_ends[is_gap].tolist(), strict=True
+    ):
         offset = gap_start
-        for frame_bytes in _measure_unknown_frames(
-            content, gap_start, gap_end, receive_time_size_bytes
+        while frame_size_bytes := _measure_unknown_frame(
+            content, offset, gap_end, receive_time_size_bytes
         ):
             unknown_frame_count += 1
-            offset += frame_bytes
+            offset += frame_size_bytes
         byte_count_outside_frames += gap_end - offset
-        bytes_after_last_frame = content[offset:gap_end] if gap_end == len(content) else b""
-    # Also True if the file ends before the first byte of the frame
-    begins_frame = {
-        *bytes_after_last_frame[receive_time_size_bytes : receive_time_size_bytes + 1]
-    } <= {
-        MAGIC_BYTE_V1,
-        MAGIC_BYTE_V2,
-    }
+    bytes_after_last_frame = content[offset:]
+    first_byte = bytes_after_last_frame[receive_time_size_bytes : receive_time_size_bytes + 1]
     is_last_frame_incomplete = (
-        0 < len(bytes_after_last_frame) < receive_time_size_bytes + MAX_FRAME_BYTES and begins_frame
+        0 < len(bytes_after_last_frame) < receive_time_size_bytes + MAX_FRAME_BYTES
+        # Empty if the file ends within the receive time
+        and first_byte in (b"", bytes([MAGIC_BYTE_V1]), bytes([MAGIC_BYTE_V2]))
     )
     return unknown_frame_count, byte_count_outside_frames, is_last_frame_incomplete
 
 
-def _measure_unknown_frames(
+def _measure_unknown_frame(
     content: bytes, offset: int, gap_end: int, receive_time_size_bytes: int
-) -> Iterator[int]:
-    """Yield the size (bytes) of each frame with an unknown message between valid frames."""
-    while offset + receive_time_size_bytes + HEADER_BYTES_V1 + CHECKSUM_BYTES <= gap_end:
-        header = content[
-            offset + receive_time_size_bytes : offset + receive_time_size_bytes + HEADER_BYTES_V2
-        ]
-        message_id = header[5]
-        frame_bytes = receive_time_size_bytes + header[1] + HEADER_BYTES_V1 + CHECKSUM_BYTES
-        if header[0] == MAGIC_BYTE_V2:
-            message_id = int.from_bytes(header[7:10], "little")
-            frame_bytes += (
-                HEADER_BYTES_V2 - HEADER_BYTES_V1 + SIGNATURE_BYTES * (header[2] & SIGNED_FLAG)
-            )
-        offset += frame_bytes
-        if (
-            header[0] not in (MAGIC_BYTE_V1, MAGIC_BYTE_V2)
-            or message_id in dialect.mavlink_map
-            or offset > gap_end
-        ):
-            return
-        yield frame_bytes
+) -> int:
+    """Return the size (bytes) of a frame with an unknown message, with its receive time.
+
+    Return 0 if no such frame begins at the offset.
+    """
+    header_offset = offset + receive_time_size_bytes
+    if header_offset + HEADER_BYTES_V1 > gap_end:
+        return 0
+    header = content[header_offset : header_offset + HEADER_BYTES_V2]
+    frame_size_bytes = receive_time_size_bytes + header[LENGTH_OFFSET] + CHECKSUM_BYTES
+    if header[0] == MAGIC_BYTE_V1:
+        message_id = header[MESSAGE_ID_OFFSET_V1]
+        frame_size_bytes += HEADER_BYTES_V1
+    elif header[0] == MAGIC_BYTE_V2:
+        message_id = int.from_bytes(header[MESSAGE_ID_OFFSET_V2:], "little")
+        frame_size_bytes += HEADER_BYTES_V2 + SIGNATURE_BYTES * (
+            header[FLAGS_OFFSET_V2] & SIGNED_FLAG
+        )
+    else:
+        return 0
+    # A frame with a known message has an invalid checksum: the valid frames are not in the gaps
+    is_known = message_id in dialect.mavlink_map
+    return 0 if is_known or offset + frame_size_bytes > gap_end else frame_size_bytes
 
 
 def _read_receive_times(
@@ -357,14 +354,12 @@ def _read_receive_times(
     is_usable &= (receive_times_us >= 0) & (receive_times_us < 1 << 62)
     median_receive_time_us = int(np.median(receive_times_us[is_usable])) if np.any(is_usable) else 0
     is_usable &= np.abs(receive_times_us - median_receive_time_us) <= MAX_RECEIVE_TIME_DIFFERENCE_US
-    receive_times_us = np.where(is_usable, receive_times_us, 0)
-    if np.any(is_usable):
-        rows = np.flatnonzero(is_usable)
-        # Interpolate times relative to the first, so that float64 resolves microseconds
-        time_since_first_receipt_us = np.interp(
-            np.arange(len(start_offsets)), rows, receive_times_us[rows] - receive_times_us[rows[0]]
-        )
-        receive_times_us = receive_times_us[rows[0]] + np.rint(time_since_first_receipt_us).astype(
-            np.int64
-        )
-    return receive_times_us
+    rows = np.flatnonzero(is_usable)
+    if not len(rows):
+        return np.zeros_like(receive_times_us)
+    # Interpolate times relative to the first, so that float64 resolves microseconds
+    first_time_us = receive_times_us[rows[0]]
+    time_since_first_us = np.interp(
+        np.arange(len(start_offsets)), rows, receive_times_us[rows] - first_time_us
+    )
+    return np.asarray(first_time_us + np.rint(time_since_first_us).astype(np.int64))

@@ -11,7 +11,7 @@ import msgspec
 
 from px4fuse.core.record import read_toml
 from px4fuse.flight.model import Unavailable
-from px4fuse.readers.common import Layout, expand_layouts
+from px4fuse.readers.common import MessageLayout, expand_layouts
 
 AUTOPILOT_COMPONENT_ID = 1  # MAV_COMP_ID_AUTOPILOT1
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: sent by ground stations, cameras, companions
@@ -46,8 +46,6 @@ class PositionMessageType:
     # Name of the position source for the option --position-source
     track_name: str
     description: str
-    # Name of the field definition in ``mavlink_messages.toml``; by default ``track_name``
-    layout_name: str = ""
     kind: str = "uwb"
     # Coordinate frame of the positions
     frame: str = "unknown"
@@ -59,8 +57,9 @@ class PositionMessageType:
     drops_covariance: bool = False
 
     @property
-    def layout(self) -> Layout:
-        return MESSAGE_LAYOUTS[self.layout_name or self.track_name]
+    def layout(self) -> MessageLayout:
+        """Fields of the message; those of ODOMETRY for its parts, such as ODOMETRY_VIO."""
+        return MESSAGE_LAYOUTS.get(self.track_name, MESSAGE_LAYOUTS["ODOMETRY"])
 
     @property
     def message(self) -> str:

@@ -15,7 +15,12 @@ from px4fuse.flight.model import (
     Unavailable,
     find_source_origin,
 )
-from px4fuse.readers.common import Layout, join_nearest, read_attitude, read_orientation
+from px4fuse.readers.common import (
+    MessageLayout,
+    join_nearest_samples,
+    read_attitude,
+    read_orientation,
+)
 from px4fuse.readers.mavlink_frames import MavlinkAddress
 from px4fuse.readers.mavlink_messages import (
     CONVERSION_BY_MAV_FRAME,
@@ -24,10 +29,11 @@ from px4fuse.readers.mavlink_messages import (
     MESSAGE_LAYOUTS,
     POSITION_MESSAGE_TYPES,
     TRUTH_LAYOUTS,
+    FrameConversion,
     PositionMessageType,
 )
 from px4fuse.readers.mavlink_recording import BOOT_CLOCK_TEXT, RECEIPT_CLOCK_TEXT, Recording
-from px4fuse.readers.mavlink_senders import ClockMapping, find_senders
+from px4fuse.readers.mavlink_senders import SenderClockConversion, find_senders
 from px4fuse.readers.px4_positions import (
     FIX_TYPE_3D,
     MIN_TRACK_SAMPLES,
@@ -50,13 +56,13 @@ MAX_ORIGIN_TIME_DIFFERENCE_S = 0.05
 
 
 def read_positions(
-    recording: Recording, clocks: dict[MavlinkAddress, ClockMapping], delay_s: float
+    recording: Recording, clocks: dict[MavlinkAddress, SenderClockConversion], delay_s: float
 ) -> TracksAndMissingSources:
     """Read the external positions sent to the autopilot, and the GNSS positions.
 
     Parameters
     ----------
-    clocks : mapping from address to ClockMapping
+    clocks : mapping from address to SenderClockConversion
         Conversion of each sender's clock to the autopilot's boot clock.
     delay_s : float
         Delay (s) from GNSS measurement to timestamp that the autopilot assumes.
@@ -87,35 +93,39 @@ def _read_track(
     recording: Recording,
     source: PositionMessageType,
     sender: MavlinkAddress,
-    clock: ClockMapping,
+    clock: SenderClockConversion,
     senders: list[MavlinkAddress],
 ) -> PositionTrack | Unavailable | None:
     """Read the positions from one sender and message type; None without messages."""
     rows = recording.rows(source.message, sender)
     table = recording.frames.table(source.message, rows)
     if source.estimator_type is not None:
-        has_estimator_type_of_source = table["estimator_type"] == source.estimator_type
-        rows = rows[has_estimator_type_of_source]
-        table = table[has_estimator_type_of_source]
+        has_estimator_type = table["estimator_type"] == source.estimator_type
+        rows, table = rows[has_estimator_type], table[has_estimator_type]
     if not len(rows):
         return None
-    track_name = source.track_name + (f"_{sender[0]}_{sender[1]}" if len(senders) > 1 else "")
-    timestamp_s = table[source.timestamp_field] * 1e-6
-    sample_boot_time_s = recording.compute_receipt_boot_times_s(rows)
+    track_name = source.track_name
+    if len(senders) > 1:
+        track_name += f"_{sender[0]}_{sender[1]}"
+    boot_times_s = recording.compute_receipt_boot_times_s(rows)
     if clock.sender_to_boot_fit is not None:
-        sample_boot_time_s = np.where(
-            timestamp_s > 0.0, clock.sender_to_boot_fit.at(timestamp_s), np.nan
+        timestamps_s = table[source.timestamp_field] * 1e-6
+        boot_times_s = np.where(
+            timestamps_s > 0.0, clock.sender_to_boot_fit.at(timestamps_s), np.nan
         )
-    samples = recording.read(source.layout, rows, sample_boot_time_s, track_name)
+    samples = recording.read(source.layout, rows, boot_times_s, track_name)
     frame = source.frame
     if "frame_id" in samples and len(samples):
         # The coordinate frame of the last sample applies to all samples, as in PX4
-        frame_conversion = CONVERSION_BY_MAV_FRAME.get(int(samples["frame_id"].iloc[-1]))
-        frame = "unknown" if frame_conversion is None else frame_conversion.name
+        frame_number = int(samples["frame_id"].iloc[-1])
+        frame = CONVERSION_BY_MAV_FRAME.get(frame_number, FrameConversion("unknown")).name
     if source.drops_covariance:
         samples[Columns.POSITION_VARIANCE + Columns.ROTATION_VARIANCE] = np.nan
     orientation = read_orientation(samples)
     clock_map = clock.description
+    clock_text = clock_map.clock
+    if clock_map.method != "boot clock":
+        clock_text = f"autopilot boot clock, converted from {clock_text} by {clock_map.method}"
     return make_track(
         track_name,
         samples,
@@ -124,9 +134,7 @@ def _read_track(
         is_odometry=orientation is not None,
         description=source.description,
         frame=frame,
-        clock=clock_map.clock
-        if clock_map.method == "boot clock"
-        else f"autopilot boot clock, converted from {clock_map.clock} by {clock_map.method}",
+        clock=clock_text,
         topics=(source.message,),
         log=recording.frames.name,
         clock_map=clock_map,
@@ -135,7 +143,7 @@ def _read_track(
 
 
 def _read_gnss(
-    recording: Recording, layout: Layout, delay_s: float
+    recording: Recording, layout: MessageLayout, delay_s: float
 ) -> PositionTrack | Unavailable | None:
     """Read GNSS fixes as NED positions relative to the local origin; None without messages.
 
@@ -193,7 +201,7 @@ def find_local_origin(recording: Recording) -> GeodeticPosition | None:
     sent_origins = recording.read(MESSAGE_LAYOUTS["GPS_GLOBAL_ORIGIN"]).dropna()
     if len(sent_origins):
         return tuple(sent_origins.iloc[-1].tolist())
-    joined_positions = join_nearest(
+    joined_positions = join_nearest_samples(
         recording.read(MESSAGE_LAYOUTS["GLOBAL_POSITION_INT"]),
         recording.read(LOCAL_POSITION_LAYOUT)[Columns.POSITION],
         MAX_ORIGIN_TIME_DIFFERENCE_S,

@@ -18,7 +18,7 @@ from scipy.stats import theilslopes
 
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.flight.model import Columns, DataSource, time_index
-from px4fuse.readers.common import MAX_FIELD_VALUE, MIN_QUATERNION_NORM, Layout
+from px4fuse.readers.common import MAX_FIELD_VALUE, MIN_QUATERNION_NORM, MessageLayout
 from px4fuse.readers.mavlink_frames import (
     MavlinkAddress,
     MavlinkFrames,
@@ -55,7 +55,7 @@ MIN_DISTINCT_TIME_FRACTION = 0.1
 # Minimum backward step (s) of the boot clock at a restart
 MIN_BACKWARD_STEP_AT_RESTART_S = 5.0
 # Number of messages around a backward step of the timestamps that confirm a restart
-RESTART_CHECK_MESSAGES = 20
+RESTART_CHECK_MESSAGE_COUNT = 20
 # Timestamps without long gaps form a group. A group at the start or end of the recording is invalid
 # if it has fewer timestamps than this fraction of the largest group
 MIN_TIMESTAMP_GROUP_FRACTION = 0.01
@@ -96,7 +96,7 @@ class ClockLine:
 def fit_clock_line(x: Array, y: Array) -> ClockLine:
     """Fit a line to clock readings x and y (s); y is read after x, with an unknown delay.
 
-    The fit uses the readings with the least delay.
+    The fit uses the reading with the least delay in each interval.
     """
     time_order = np.argsort(x, kind="stable")
     x, y = x[time_order], y[time_order]
@@ -104,17 +104,21 @@ def fit_clock_line(x: Array, y: Array) -> ClockLine:
     interval_count = int(np.clip(span_s / CLOCK_FIT_INTERVAL_S, 1, MAX_CLOCK_FIT_INTERVALS))
     interval_starts = np.searchsorted(x, np.linspace(x[0], x[-1], interval_count + 1)[1:-1])
     rows_by_interval = [rows for rows in np.split(np.arange(len(x)), interval_starts) if len(rows)]
-    middle_rows = [rows[len(rows) // 2] for rows in rows_by_interval]
-    slope = _fit_clock_rate(x[middle_rows], y[middle_rows])
+    # First approximation, from any reading of each interval
+    rows = [interval_rows[len(interval_rows) // 2] for interval_rows in rows_by_interval]
+    slope = _fit_clock_rate(x[rows], y[rows])
     if abs(slope - 1.0) <= MAX_RELATIVE_CLOCK_RATE_DIFFERENCE:
         slope = 1.0
     # Fit the slope twice, because the slope affects which messages have the least delay
-    for is_slope_final in (False, False, True):
+    for fit_number in range(3):
         relative_delay_s = y - slope * (x - x0)
-        least_delay_rows = [rows[np.argmin(relative_delay_s[rows])] for rows in rows_by_interval]
-        if not is_slope_final and span_s >= MIN_DRIFT_SPAN_S:
-            slope = _fit_clock_rate(x[least_delay_rows], relative_delay_s[least_delay_rows], slope)
-    y0 = float(np.median(relative_delay_s[least_delay_rows]))
+        rows = [
+            interval_rows[np.argmin(relative_delay_s[interval_rows])]
+            for interval_rows in rows_by_interval
+        ]
+        if fit_number < 2 and span_s >= MIN_DRIFT_SPAN_S:
+            slope = _fit_clock_rate(x[rows], relative_delay_s[rows], slope)
+    y0 = float(np.median(relative_delay_s[rows]))
     return ClockLine(x0, y0, slope, robust_std(relative_delay_s), len(x))
 
 
@@ -183,13 +187,13 @@ class Recording:
         """Return the fields of all messages of one type from the autopilot, in MAVLink units."""
         return self.frames.table(message, self.rows(message))
 
-    def find_most_frequent(self, layouts: Sequence[Layout]) -> Layout:
+    def find_most_frequent_layout(self, layouts: Sequence[MessageLayout]) -> MessageLayout:
         """Return the layout of the message type that the autopilot sent most often."""
         return max(layouts, key=lambda layout: len(self.rows(layout.topic)))
 
     def read(
         self,
-        layout: Layout,
+        layout: MessageLayout,
         rows: IntArray | None = None,
         boot_times_s: Array | None = None,
         name: str = "",
@@ -200,7 +204,7 @@ class Recording:
 
         Parameters
         ----------
-        layout : Layout
+        layout : MessageLayout
             Message and fields to read.
         rows : ndarray, shape (n,), optional
             Frame indices; by default all frames from the autopilot.
@@ -266,7 +270,7 @@ class Recording:
         if not self.receive_to_boot_time_fit.reading_pair_count:
             return self.compute_receipt_boot_times_s(rows)
         if "time_boot_ms" in (table.dtype.names or ()):
-            return np.asarray(table["time_boot_ms"] * 1e-3)
+            return table["time_boot_ms"] * 1e-3
         timestamp_s: Array = table["time_usec"] * 1e-6
         # time_usec is boot time or UNIX time; both are valid if the origin has the same clock
         is_boot_time = (timestamp_s > 0.0) & (
@@ -294,15 +298,19 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
     converted_samples = samples.copy()
     converted_samples[samples.columns.difference(UNCONVERTED_COLUMNS)] = np.nan
     for frame_number, frame in CONVERSION_BY_MAV_FRAME.items():
-        is_in_frame = (samples["frame_id"] == frame_number) & (not frame.is_body_frame)
-        is_in_child_frame = (samples["child_frame_id"] == frame_number) & (
-            has_quaternion | (not frame.is_body_frame)
-        )
-        if min(frame.axis_signs) > 0.0:
-            converted_samples.loc[is_in_frame, orientation] = samples.loc[is_in_frame, orientation]
+        is_position_in_frame = samples["frame_id"] == frame_number
+        is_velocity_in_frame = samples["child_frame_id"] == frame_number
+        if frame.is_body_frame:
+            # A position cannot be in the body frame. The conversion of the velocity needs attitude
+            is_position_in_frame[:] = False
+            is_velocity_in_frame &= has_quaternion
+        elif min(frame.axis_signs) > 0.0:
+            # Quaternions relative to ENU or FLU are not converted
+            rows = is_position_in_frame
+            converted_samples.loc[rows, orientation] = samples.loc[rows, orientation]
         for rows, vector_columns, variance_columns in (
-            (is_in_frame, Columns.POSITION, Columns.POSITION_VARIANCE),
-            (is_in_child_frame, Columns.VELOCITY, Columns.VELOCITY_VARIANCE),
+            (is_position_in_frame, Columns.POSITION, Columns.POSITION_VARIANCE),
+            (is_velocity_in_frame, Columns.VELOCITY, Columns.VELOCITY_VARIANCE),
         ):
             vectors = (
                 samples.loc[rows, vector_columns].to_numpy()[:, frame.axis_order] * frame.axis_signs
@@ -341,13 +349,7 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
     notes: list[str] = []
     rows, boot_times_s = _read_boot_times(frames, address)
     analysed_frame_slice = slice(0, len(frames))
-    restart_rows = np.flatnonzero(np.diff(boot_times_s) < -MIN_BACKWARD_STEP_AT_RESTART_S) + 1
-    # A backward step due to a single late or early packet is not a restart
-    earlier_rows = np.maximum(restart_rows - 1 - RESTART_CHECK_MESSAGES, 0)
-    later_rows = np.minimum(restart_rows + RESTART_CHECK_MESSAGES, len(rows) - 1)
-    boot_times_before_s = np.minimum(boot_times_s[earlier_rows], boot_times_s[restart_rows - 1])
-    is_restart = boot_times_s[later_rows] < boot_times_before_s - MIN_BACKWARD_STEP_AT_RESTART_S
-    restart_rows = restart_rows[is_restart]
+    restart_rows = _find_restarts(boot_times_s)
     if len(restart_rows):
         parts = np.split(np.arange(len(rows)), restart_rows)
         longest_part = max(parts, key=len)
@@ -367,8 +369,9 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
         find_longest_increasing_subsequence(np.rint(boot_times_s * 1e6).astype(np.int64)),
     )
     rows, boot_times_s = rows[increasing_time_rows], boot_times_s[increasing_time_rows]
-    receive_to_boot_time_fit = ClockLine(0.0, 0.0, 1.0, 0.0, len(rows))
+    # By default, all receive times are zero, and equal to the boot times
     receive_times_s = np.zeros(len(frames))
+    receive_to_boot_time_fit = ClockLine(0.0, 0.0, 1.0, 0.0, len(rows))
     if frames.receive_times_us is not None:
         receive_times_s = (frames.receive_times_us - frames.receive_times_us[0]) * 1e-6
         if len(rows):
@@ -389,11 +392,25 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
         analysed_frame_slice,
         receive_times_s,
         receive_to_boot_time_fit,
-        time_origin_s,
-        end_s - time_origin_s,
-        notes,
-        len(restart_rows) or None,
+        time_origin_s=time_origin_s,
+        duration_s=end_s - time_origin_s,
+        notes=notes,
+        restart_count=len(restart_rows) or None,
     )
+
+
+def _find_restarts(boot_times_s: Array) -> IntArray:
+    """Return the index of the first boot time after each restart of the autopilot.
+
+    A backward step due to a single late or early packet is not a restart: the boot time is also
+    smaller between RESTART_CHECK_MESSAGE_COUNT messages before and after the step.
+    """
+    rows = np.flatnonzero(np.diff(boot_times_s) < -MIN_BACKWARD_STEP_AT_RESTART_S) + 1
+    earlier_rows = np.maximum(rows - 1 - RESTART_CHECK_MESSAGE_COUNT, 0)
+    later_rows = np.minimum(rows + RESTART_CHECK_MESSAGE_COUNT, len(boot_times_s) - 1)
+    times_before_s = np.minimum(boot_times_s[earlier_rows], boot_times_s[rows - 1])
+    is_restart = boot_times_s[later_rows] < times_before_s - MIN_BACKWARD_STEP_AT_RESTART_S
+    return rows[is_restart]
 
 
 def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from px4fuse.core.arrays import Array, ArrayPair, IntArray
 from px4fuse.errors import SettingsError
-from px4fuse.flight.model import ClockMap, Sender
+from px4fuse.flight.model import ClockConversion, Sender
 from px4fuse.readers.mavlink_frames import VEHICLE_TYPES, MavlinkAddress, MavlinkFrames
 from px4fuse.readers.mavlink_messages import (
     AUTOPILOT_COMPONENT_ID,
@@ -52,14 +52,14 @@ MAX_REGULAR_SAMPLE_INTERVAL_S = 1.0
 
 
 @dataclass(frozen=True)
-class ClockMapping:
+class SenderClockConversion:
     """Conversion of a sender's timestamps to the autopilot's boot clock, with a description.
 
     ``sender_to_boot_fit`` is None if receive times replace the timestamps.
     """
 
     sender_to_boot_fit: ClockLine | None
-    description: ClockMap
+    description: ClockConversion
 
 
 def _read_vehicle_types(frames: MavlinkFrames) -> dict[MavlinkAddress, tuple[int, int]]:
@@ -104,17 +104,20 @@ def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[Mavl
     ]
     rows = np.concatenate([frames.rows(message) for message in AUTOPILOT_MESSAGES])
     addresses_with_autopilot_message = _count_frames(frames, rows)
-    # A heartbeat is not sufficient, because companion computers may also send autopilot heartbeats
     candidates = (
+        # A heartbeat is not sufficient, because companion computers may send autopilot heartbeats
         [address for address in vehicle_addresses if address in addresses_with_autopilot_message]
+        # Autopilots whose heartbeats are not in the recording
         or [address for address in addresses_with_autopilot_message if address not in vehicle_types]
+        # Autopilots of which the recording contains only heartbeats
         or vehicle_addresses
         # If no message is from an autopilot, assume one in each system
         or [(system, AUTOPILOT_COMPONENT_ID) for system, _ in frame_counts]
     )
     if system_id is not None:
+        # If the user gives the id, the heartbeat is sufficient
         candidates = [
-            address for address in {*vehicle_addresses, *candidates} if address[0] == system_id
+            address for address in (*vehicle_addresses, *candidates) if address[0] == system_id
         ]
         if not candidates:
             system_ids = sorted({address[0] for address in vehicle_addresses})
@@ -143,7 +146,7 @@ def find_senders(recording: Recording, message: str) -> list[MavlinkAddress]:
     ][:MAX_SENDERS]
 
 
-def map_sender_clocks(recording: Recording) -> dict[MavlinkAddress, ClockMapping]:
+def map_sender_clocks(recording: Recording) -> dict[MavlinkAddress, SenderClockConversion]:
     """Return the conversion of each position sender's clock to the autopilot's boot clock."""
     message_names = {source.message for source in POSITION_MESSAGE_TYPES}
     senders = {address for message in message_names for address in find_senders(recording, message)}
@@ -155,57 +158,48 @@ def map_sender_clocks(recording: Recording) -> dict[MavlinkAddress, ClockMapping
 
 def _map_sender_clock(
     recording: Recording, sender: MavlinkAddress, boot_to_unix_fit: ClockLine | None
-) -> ClockMapping:
+) -> SenderClockConversion:
     frames = recording.frames
-    timestamps_s = []
-    receive_times_s = []
+    rows, timestamps_s = [], []
     for source in POSITION_MESSAGE_TYPES:
-        rows = recording.rows(source.message, sender)
-        timestamps_s.append(frames.table(source.message, rows)[source.timestamp_field] * 1e-6)
-        receive_times_s.append(recording.receive_times_s[rows])
-    median_timestamp_s = np.median(np.concatenate(timestamps_s))
-    has_running_clock = is_running_clock(np.concatenate(timestamps_s))
-    rows = recording.rows("TIMESYNC", sender)
-    timesync = frames.table("TIMESYNC", rows)
-    sender_reply_times_s = timesync["tc1"] * 1e-9
-    timesync_request_times_s = timesync["ts1"] * 1e-9
-    # TIMESYNC replies of the sender contain the time of the request in ts1. In requests of the
-    # autopilot this is its boot time, so ts1 must be near the boot time of the reply
-    is_sender_reply = (sender_reply_times_s != 0.0) & (
-        np.abs(timesync_request_times_s - recording.compute_receipt_boot_times_s(rows))
+        rows.append(recording.rows(source.message, sender))
+        timestamps_s.append(frames.table(source.message, rows[-1])[source.timestamp_field] * 1e-6)
+    position_times_s = np.concatenate(timestamps_s)
+    median_time_s = np.median(position_times_s)
+    # In TIMESYNC, ts1 is the time of the request (clock of the requester). tc1 is the time of the
+    # reply, and 0 in requests
+    timesync_rows = recording.rows("TIMESYNC", sender)
+    timesync = frames.table("TIMESYNC", timesync_rows)
+    request_times_s, reply_times_s = timesync["ts1"] * 1e-9, timesync["tc1"] * 1e-9
+    # In replies to the autopilot, the time of the request is near the boot time of the reply
+    is_reply = (timesync["tc1"] != 0) & (
+        np.abs(request_times_s - recording.compute_receipt_boot_times_s(timesync_rows))
         <= MIN_BACKWARD_STEP_AT_RESTART_S
     )
-    # The clock fit also uses TIMESYNC requests of the sender: their delay is small, because the
-    # sender reads its clock just before sending
-    is_timesync_request = (
-        has_running_clock
-        & (sender_reply_times_s == 0.0)
-        & (
-            np.abs(timesync_request_times_s - median_timestamp_s)
-            < MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S
+    if is_running_clock(position_times_s):
+        # The clock fit also uses TIMESYNC requests of the sender: their delay is small, because the
+        # sender reads its clock just before sending
+        is_request = (timesync["tc1"] == 0) & (
+            np.abs(request_times_s - median_time_s) < MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S
         )
-    )
-    timestamps_s.append(timesync_request_times_s[is_timesync_request])
-    receive_times_s.append(recording.receive_times_s[rows][is_timesync_request])
-    autopilot_timesync = recording.table("TIMESYNC")
-    autopilot_reply_times_s = autopilot_timesync["tc1"] * 1e-9
-    sender_request_times_s = autopilot_timesync["ts1"] * 1e-9
-    is_autopilot_reply = (autopilot_reply_times_s != 0.0) & (
-        np.abs(sender_request_times_s - median_timestamp_s)
-        < MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S
-    )
-    # Exclude the autopilot's replies to requests of other senders
-    rows = frames.rows("TIMESYNC")
-    other_timesync = frames.table("TIMESYNC", rows[~frames.is_sent_by(sender, rows)])
-    other_request_times_ns = other_timesync["ts1"][other_timesync["tc1"] == 0]
-    is_autopilot_reply &= ~np.isin(autopilot_timesync["ts1"], other_request_times_ns)
+        rows.append(timesync_rows[is_request])
+        timestamps_s.append(request_times_s[is_request])
+    # Replies of the autopilot to this sender: no other sender sent the request
+    all_rows = frames.rows("TIMESYNC")
+    other_timesync = frames.table("TIMESYNC", all_rows[~frames.is_sent_by(sender, all_rows)])
+    other_requests = other_timesync["ts1"][other_timesync["tc1"] == 0]
+    replies = recording.table("TIMESYNC")
+    replies = replies[(replies["tc1"] != 0) & ~np.isin(replies["ts1"], other_requests)]
+    replies = replies[
+        np.abs(replies["ts1"] * 1e-9 - median_time_s) < MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S
+    ]
     return map_clock_to_boot(
         f"system {sender[0]}, component {sender[1]}",
         np.concatenate(timestamps_s),
-        np.concatenate(receive_times_s),
+        recording.receive_times_s[np.concatenate(rows)],
         recording.receive_to_boot_time_fit,
-        (timesync_request_times_s[is_sender_reply], sender_reply_times_s[is_sender_reply]),
-        (sender_request_times_s[is_autopilot_reply], autopilot_reply_times_s[is_autopilot_reply]),
+        (request_times_s[is_reply], reply_times_s[is_reply]),
+        (replies["ts1"] * 1e-9, replies["tc1"] * 1e-9),
         boot_to_unix_fit,
         has_receive_times=frames.receive_times_us is not None,
     )
@@ -221,7 +215,7 @@ def map_clock_to_boot(
     boot_to_unix_fit: ClockLine | None,
     *,
     has_receive_times: bool,
-) -> ClockMapping:
+) -> SenderClockConversion:
     """Find the conversion of a sender's clock to the autopilot's boot clock.
 
     The first conversion that applies is used:
@@ -261,46 +255,39 @@ def map_clock_to_boot(
         intervals_s = np.diff(receive_times_s)
         intervals_s = intervals_s[intervals_s < MAX_REGULAR_SAMPLE_INTERVAL_S]
         jitter_s = float(np.std(intervals_s) / np.sqrt(2.0)) if len(intervals_s) else 0.0
-        return ClockMapping(
+        return SenderClockConversion(
             None,
-            ClockMap(
+            ClockConversion(
                 name, time_source, len(timestamps_s), 0.0, 0.0, jitter_s, note, distinct_count
             ),
         )
 
-    def compute_difference_from_receipt_s(boot_time_s: Array) -> float:
-        return abs(float(np.median(boot_time_at_receipt_s - boot_time_s)))
+    def compute_difference_from_receipt_s(line: ClockLine) -> float:
+        return abs(float(np.median(boot_time_at_receipt_s - line.at(timestamps_s))))
 
-    timesync_fit = _fit_timesync(sender_timesync_replies, autopilot_timesync_replies)
-    difference_from_receipt_s = compute_difference_from_receipt_s(timestamps_s)
-    # A sender clock that started only seconds after the autopilot resembles the boot clock. If
-    # TIMESYNC is available, it shows the difference
-    clock_difference_reduction_by_timesync_s = (
-        0.0
-        if timesync_fit is None
-        else difference_from_receipt_s
-        - compute_difference_from_receipt_s(timesync_fit.at(timestamps_s))
-    )
-    if (
-        difference_from_receipt_s <= MAX_BOOT_TIME_DIFFERENCE_S
-        and clock_difference_reduction_by_timesync_s < MIN_CLOCK_DIFFERENCE_REDUCTION_BY_TIMESYNC_S
-    ):
-        identity_clock_line = ClockLine(0.0, 0.0, 1.0, 0.0, len(timestamps_s))
-        note = "the timestamps of the sender are boot times of the autopilot"
-        return _make_clock_mapping(name, "boot clock", identity_clock_line, timestamps_s, note)
     clock_kind = "UNIX time" if np.median(timestamps_s) > MIN_UNIX_TIME_S else "clock"
     clock_name = f"{clock_kind} of {name}"
-    candidate_fits = [] if timesync_fit is None else [("TIMESYNC", timesync_fit, "")]
+    timesync_fit = _fit_timesync(sender_timesync_replies, autopilot_timesync_replies)
+    identity = ClockLine(0.0, 0.0, 1.0, 0.0, len(timestamps_s))
+    candidates = []
+    # A sender clock that started only seconds after the autopilot resembles the boot clock. If
+    # TIMESYNC is available, it shows the difference
+    if timesync_fit is None or (
+        compute_difference_from_receipt_s(identity)
+        - compute_difference_from_receipt_s(timesync_fit)
+        < MIN_CLOCK_DIFFERENCE_REDUCTION_BY_TIMESYNC_S
+    ):
+        note = "the timestamps of the sender are boot times of the autopilot"
+        candidates.append((name, "boot clock", identity, note))
+    if timesync_fit is not None:
+        candidates.append((clock_name, "TIMESYNC", timesync_fit, ""))
     if clock_kind == "UNIX time" and boot_to_unix_fit is not None:
-        unix_note = "assumption: the UNIX clocks of sender and autopilot are synchronised"
-        candidate_fits.append(("SYSTEM_TIME", boot_to_unix_fit.inverse(), unix_note))
-    for method, sender_to_boot_fit, note in candidate_fits:
+        note = "assumption: the UNIX clocks of sender and autopilot are synchronised"
+        candidates.append((clock_name, "SYSTEM_TIME", boot_to_unix_fit.inverse(), note))
+    for clock, method, line, note in candidates:
         # Converted timestamps that disagree with the receive times are from another clock
-        if (
-            compute_difference_from_receipt_s(sender_to_boot_fit.at(timestamps_s))
-            <= MAX_BOOT_TIME_DIFFERENCE_S
-        ):
-            return _make_clock_mapping(clock_name, method, sender_to_boot_fit, timestamps_s, note)
+        if compute_difference_from_receipt_s(line) <= MAX_BOOT_TIME_DIFFERENCE_S:
+            return _make_clock_mapping(clock, method, line, timestamps_s, note)
     sender_to_boot_fit = fit_clock_line(timestamps_s, receive_times_s)
     sender_to_boot_fit = replace(
         sender_to_boot_fit,
@@ -335,21 +322,21 @@ def _fit_timesync(
 
 def _make_clock_mapping(
     clock: str, method: str, line: ClockLine, timestamps_s: Array, note: str
-) -> ClockMapping:
+) -> SenderClockConversion:
     middle_timestamp_s = 0.5 * float(timestamps_s.min() + timestamps_s.max())
     offset_s = float(line.at(middle_timestamp_s)) - middle_timestamp_s
     drift_ppm = (line.slope - 1.0) * 1e6
-    description = ClockMap(
+    description = ClockConversion(
         clock, method, line.reading_pair_count, offset_s, drift_ppm, line.jitter_s, note
     )
-    return ClockMapping(line, description)
+    return SenderClockConversion(line, description)
 
 
 def describe_clock_conversions(
-    recording: Recording, clock_mappings: dict[MavlinkAddress, ClockMapping]
-) -> tuple[ClockMap, ...]:
+    recording: Recording, clock_conversions: dict[MavlinkAddress, SenderClockConversion]
+) -> tuple[ClockConversion, ...]:
     """Describe the conversions of sender clocks and receive times to the boot clock."""
-    clock_descriptions = [mapping.description for mapping in clock_mappings.values()]
+    clock_descriptions = [mapping.description for mapping in clock_conversions.values()]
     receive_times_us = recording.frames.receive_times_us
     receive_to_boot_time_fit = recording.receive_to_boot_time_fit
     if receive_times_us is not None and receive_to_boot_time_fit.reading_pair_count:
@@ -360,7 +347,7 @@ def describe_clock_conversions(
                 "messages"
             )
         clock_descriptions.append(
-            ClockMap(
+            ClockConversion(
                 clock="receive time (UNIX time of the recording computer)",
                 method="receive time",
                 pairs=receive_to_boot_time_fit.reading_pair_count,
@@ -402,9 +389,9 @@ def _estimate_lost_fraction(frames: MavlinkFrames, address: MavlinkAddress) -> f
     """
     sequence_numbers = frames.sequence_numbers[frames.is_sent_by(address)].astype(np.int64)
     sequence_steps = np.mod(np.diff(sequence_numbers) + MAX_LATE_MESSAGES, 256) - MAX_LATE_MESSAGES
-    unwrapped_sequence = np.append(0, np.cumsum(sequence_steps))
-    sent_count = np.ptp(unwrapped_sequence) + 1
-    lost_fraction = float(1.0 - len(np.unique(unwrapped_sequence)) / sent_count)
-    has_sequence_numbers = len(unwrapped_sequence) == 1 or unwrapped_sequence.any()
+    unwrapped_sequence_numbers = np.append(0, np.cumsum(sequence_steps))
+    sent_count = np.ptp(unwrapped_sequence_numbers) + 1
+    lost_fraction = float(1.0 - len(np.unique(unwrapped_sequence_numbers)) / sent_count)
+    has_sequence_numbers = len(unwrapped_sequence_numbers) == 1 or unwrapped_sequence_numbers.any()
     is_usable = has_sequence_numbers and lost_fraction < MAX_LOST_MESSAGE_FRACTION
     return lost_fraction if is_usable else None

@@ -6,7 +6,7 @@ The positions keep the clock and the coordinate frame of the file.
 """
 
 import hashlib
-from collections.abc import Container, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -36,10 +36,9 @@ from px4fuse.readers.recording_table import (
     MAX_FILE_BYTES,
     MAX_VALID_UNIX_TIME_S,
     MIN_VALID_UNIX_TIME_S,
-    SEPARATORS,
     PositionTable,
     choose_body,
-    find_table,
+    find_position_table,
     quote,
     refuse_foreign_format,
 )
@@ -54,16 +53,16 @@ MAX_TAGS_IN_FILE = 100
 MIN_USABLE_ROWS = 3
 # Minimum fraction of rows with the expected pattern, such as increasing times
 MIN_MATCHING_ROW_FRACTION = 0.9
-# Plausible time units, and minimum and maximum median interval (s): 0.2 to 200 UWB positions per
-# second, ±10 %
-UWB_TIMES = tuple(SECONDS_BY_TIME_UNIT), 0.9 / 200, 1.1 / 0.2
-TRAJECTORY_TIMES = ("s", "ns"), 1e-3, 1e3
 # Maximum median interval (s) of timestamps that are UNIX times
-MAX_UNIX_TIME_INTERVAL_S = 60.0
+MAX_MEDIAN_UNIX_TIMESTAMP_INTERVAL_S = 60.0
 # Maximum extent (m) of an indoor flight; otherwise, the positions are probably in mm
 MAX_INDOOR_EXTENT_M = 200.0
 # Maximum absolute coordinate; larger values are timestamps or damaged text
 MAX_COORDINATE_IN_FILE_UNIT = 1e9
+# Plausible time units, with minimum and maximum median interval (s): 0.2 to 200 UWB positions per
+# second, ±10 %
+UWB_INTERVALS_S = dict.fromkeys(SECONDS_BY_TIME_UNIT, (0.9 / 200, 1.1 / 0.2))
+TRAJECTORY_INTERVALS_S = dict.fromkeys(("s", "ns"), (1e-3, 1e3))
 
 
 @dataclass(frozen=True)
@@ -141,74 +140,69 @@ def read_position_file(
     if columns:
         column_meanings = _interpret_given_columns(table, column_meanings, columns)
     quaternion_columns = find_quaternion_columns(table.column_names)
-    numeric_table, has_time_zone = _read_numbers(table, column_meanings, quaternion_columns, body)
-    row_count = len(numeric_table)
-    time_column, time_text = _detect_time_column(table, column_meanings, numeric_table)
-    frame, axis_columns = _find_axes(column_meanings, numeric_table)
+    numbers, column_meanings, has_time_zone = _read_numbers(
+        table, column_meanings, quaternion_columns, body
+    )
+    row_count = len(numbers)
+    time_column, time_text = _detect_time_column(table, column_meanings, numbers)
+    frame, axis_columns = _find_axes(column_meanings, numbers)
     sigma_columns = find_sigma_columns(column_meanings, frame)
     position_columns = [index for index in axis_columns if index is not None]
-    # pandas reads numbers such as 1e999 as infinite
-    has_time = np.isfinite(numeric_table[time_column])
-    is_usable = has_time & (
-        numeric_table[position_columns].abs() < MAX_COORDINATE_IN_FILE_UNIT
-    ).all(axis=1)
-    if unusable_count := np.count_nonzero(~is_usable):
+
+    # Select the rows with a time and a position. pandas reads numbers such as 1e999 as infinite
+    has_time = np.isfinite(numbers[time_column])
+    has_position = (numbers[position_columns].abs() < MAX_COORDINATE_IN_FILE_UNIT).all(axis=1)
+    dropped_rows = numbers.index[~(has_time & has_position)]
+    if len(dropped_rows):
         notes.append(
-            f"number of dropped rows without valid time or position: {unusable_count}"
-            f"{table.format_first_line_number(numeric_table.index[~is_usable])}"
+            f"number of dropped rows without valid time or position: {len(dropped_rows)}"
+            f"{table.format_first_line_number(dropped_rows)}"
         )
-    times_without_position = numeric_table.loc[has_time & ~is_usable, time_column].to_numpy()
-    numeric_table = numeric_table[is_usable]
-    time_units, min_interval_s, max_interval_s = TRAJECTORY_TIMES if is_trajectory else UWB_TIMES
-    unit, unit_text = "frame numbers", f"the frame rate is {table.rate_hz or 0:g} Hz"
-    if table.rate_hz is None:
-        unit, unit_text = _choose_time_unit(
-            numeric_table[time_column],
-            column_meanings[time_column].unit,
-            time_unit,
-            time_units,
-            (min_interval_s, max_interval_s),
-        )
+    times_without_position = numbers.loc[has_time & ~has_position, time_column].to_numpy()
+    numbers = numbers[has_time & has_position]
+
+    # Convert the times to seconds, and select the rows with increasing times
+    plausible_intervals_s = TRAJECTORY_INTERVALS_S if is_trajectory else UWB_INTERVALS_S
+    unit, unit_reason = _choose_time_unit(
+        numbers[time_column],
+        table.rate_hz,
+        column_meanings[time_column].unit,
+        time_unit,
+        plausible_intervals_s,
+    )
     units_per_second = table.rate_hz or round(1.0 / SECONDS_BY_TIME_UNIT[unit])
-    times_s = numeric_table[time_column].to_numpy() / units_per_second
-    kept_rows = _find_increasing_rows(times_s)
-    if dropped_count := len(times_s) - len(kept_rows):
+    times_s = numbers[time_column].to_numpy() / units_per_second
+    increasing_rows = _find_increasing_rows(times_s)
+    if dropped_count := len(times_s) - len(increasing_rows):
         notes.append(
             "number of dropped rows (timestamp repeated, decreasing or after the year 2100): "
             f"{dropped_count}"
         )
-    has_no_times = (
-        table.format == HEADERLESS_TABLE_FORMAT
-        and len(kept_rows) < MIN_MATCHING_ROW_FRACTION * row_count
-    )
-    if has_no_times or len(kept_rows) < MIN_USABLE_ROWS:
-        fault = (
-            f"{table.file_name} contains {len(kept_rows)} usable rows, fewer than {MIN_USABLE_ROWS}"
-        )
-        raise LogError(
-            "; ".join((fault, *notes)),
-            "Write numbers with decimal points. Alternatively, name the columns with "
-            f"{COLUMNS_OPTION}.",
-        )
-    numeric_table = numeric_table.iloc[kept_rows].set_index(time_index(times_s[kept_rows]))
-    median_interval_s = compute_median_interval_s(numeric_table.index)
+    numbers = numbers.iloc[increasing_rows].set_index(time_index(times_s[increasing_rows]))
+    _check_row_count(table, len(numbers), row_count, notes)
+    median_interval_s = compute_median_interval_s(numbers.index)
+    min_interval_s, max_interval_s = plausible_intervals_s["s"]
     if not min_interval_s <= median_interval_s <= max_interval_s:
         notes.append(
             f"a median interval of {median_interval_s:.3g} s is unusual: check the unit of time "
             "(--position-time-unit)"
         )
+    is_unix_time = MIN_VALID_UNIX_TIME_S <= np.median(numbers.index) < MAX_VALID_UNIX_TIME_S
+    clock_kind: Literal["UNIX", "local"] = "UNIX" if has_time_zone and is_unix_time else "local"
+
+    # Convert the positions and σ to metres, and remove invalid values
     metres_per_unit, length_unit_text = _choose_length_units(
-        numeric_table,
+        numbers[position_columns],
         position_columns,
         column_meanings,
         length_unit,
         np.inf if is_trajectory else MAX_INDOOR_EXTENT_M,
     )
     columns_m = {
-        name: np.nan if index is None else numeric_table[index] * metres_per_unit[index]
+        name: np.nan if index is None else numbers[index] * metres_per_unit[index]
         for name, index in zip(SAMPLE_COLUMNS, (*axis_columns, *sigma_columns), strict=True)
     }
-    samples = pd.DataFrame(columns_m, index=numeric_table.index).replace([np.inf, -np.inf], np.nan)
+    samples = pd.DataFrame(columns_m, numbers.index).replace([np.inf, -np.inf], np.nan)
     invalid_reasons = classify_invalid_positions(samples, SAMPLE_COLUMNS[: len(position_columns)])
     is_valid = (invalid_reasons == "") | is_trajectory
     samples = samples[is_valid]
@@ -216,12 +210,9 @@ def read_position_file(
     samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(is_ignored_sigma)
     if ignored_count := is_ignored_sigma.any(axis=1).sum():
         notes.append(f"number of rows with an ignored sigma (not positive): {ignored_count}")
-    clock_kind: Literal["UNIX", "local"] = (
-        "UNIX"
-        if has_time_zone
-        and MIN_VALID_UNIX_TIME_S <= np.median(numeric_table.index) < MAX_VALID_UNIX_TIME_S
-        else "local"
-    )
+    reasons_without_position = pd.Series("NaN", times_without_position / units_per_second)
+    reason_by_invalid_row = pd.concat([invalid_reasons[~is_valid], reasons_without_position])
+
     return PositionRecording(
         name=table.file_name,
         sha256=sha256,
@@ -231,27 +222,19 @@ def read_position_file(
         frames=(frame,) if frame else table.frames,
         dropped_row_count=dropped_count,
         format_detection_notes=(
-            f"the file format is {table.format}"
-            if table.format
-            else f"the separator is {SEPARATORS[table.separator]}, the header is line "
-            f"{table.header_line}",
-            f"time: column {time_text}, {clock_kind} clock, unit {unit} ({unit_text})",
+            table.describe_format(),
+            f"time: column {time_text}, {clock_kind} clock, unit {unit} ({unit_reason})",
             f"position: columns {table.format_labels(*axis_columns)} as "
             f"{frame.upper() if frame else 'x, y, z'}"
-            f"{' without height' * (len(position_columns) < 3)}, unit {length_unit_text}",
+            f"{'' if len(position_columns) == 3 else ' without height'}, unit {length_unit_text}",
             f"sigma: columns {table.format_labels(*sigma_columns) or 'none'}",
         ),
         notes=tuple(notes),
-        metres_per_unit=float(metres_per_unit[position_columns[0]]),
-        reason_by_invalid_row=pd.concat(
-            [
-                invalid_reasons[~is_valid],
-                pd.Series("NaN", times_without_position / units_per_second),
-            ]
-        ).sort_index(),
+        metres_per_unit=metres_per_unit[position_columns[0]],
+        reason_by_invalid_row=reason_by_invalid_row.sort_index(),
         format=table.format,
         row_count=row_count,
-        quaternions=numeric_table.loc[is_valid, quaternion_columns].to_numpy()
+        quaternions=numbers.loc[is_valid, quaternion_columns].to_numpy()
         if quaternion_columns
         else None,
         quantisation_step_m=max(
@@ -270,7 +253,7 @@ def _open_table(
         path, LogError, MAX_FILE_BYTES, remedy_if_empty="Copy or export the file again."
     )
     refuse_foreign_format(path, content, LogError)
-    table = find_table(path, content, columns, body_name)
+    table = find_position_table(path, content, columns, body_name)
     return table, hashlib.sha256(content).hexdigest(), len(content)
 
 
@@ -280,6 +263,27 @@ def _find_increasing_rows(times_s: Array) -> IntArray:
     # Replace the times by their ranks: find_longest_increasing_subsequence needs positive integers
     time_ranks = np.unique(times_s[usable_rows], return_inverse=True)[1].astype(np.int64)
     return usable_rows[find_longest_increasing_subsequence(time_ranks + 1)]
+
+
+def _check_row_count(
+    table: PositionTable, usable_count: int, row_count: int, notes: list[str]
+) -> None:
+    """Raise LogError if the table has too few usable rows.
+
+    If many rows of a table without header are not usable, its first column is not the time.
+    """
+    min_count = float(MIN_USABLE_ROWS)
+    if table.format == HEADERLESS_TABLE_FORMAT:
+        min_count = max(min_count, MIN_MATCHING_ROW_FRACTION * row_count)
+    if usable_count < min_count:
+        fault = (
+            f"{table.file_name} contains {usable_count} usable rows, fewer than {MIN_USABLE_ROWS}"
+        )
+        raise LogError(
+            "; ".join((fault, *notes)),
+            "Write numbers with decimal points. Alternatively, name the columns with "
+            f"{COLUMNS_OPTION}.",
+        )
 
 
 def _check_options(
@@ -302,34 +306,35 @@ def _check_options(
 
 def _read_numbers(
     table: PositionTable,
-    column_meanings: list[ColumnMeaning],
+    column_meanings: Sequence[ColumnMeaning],
     quaternion_columns: list[int],
     body_name: str | None,
-) -> tuple[pd.DataFrame, bool]:
+) -> tuple[pd.DataFrame, list[ColumnMeaning], bool]:
     """Convert the text of the needed columns to numbers, and dates (ISO 8601) to UNIX times.
 
-    The second value is False for dates without time zone.
+    Return also the meanings with the unit of dates, and False for dates without time zone.
     """
     known_columns = [index for index, meaning in enumerate(column_meanings) if meaning.kind]
     texts = table.read_cells([*quaternion_columns, *known_columns])
     texts = _select_body(table, texts, column_meanings, body_name)
     # DataFrame.apply returns dtype object for an empty table
-    numeric_table = texts.apply(_to_numbers, may_have_decimal_comma=table.separator != ",").astype(
+    numbers = texts.apply(_to_numbers, may_have_decimal_comma=table.separator != ",").astype(
         np.float64
     )
-    has_time_zone = True
+    meanings, has_time_zone = [*column_meanings], True
     for index, meaning in enumerate(column_meanings):
+        # If most times are not numbers, they are dates
         if (
             meaning.kind == "time"
-            and numeric_table[index].isna().mean() > 0.5
+            and numbers[index].isna().mean() > 0.5
             and texts[index].notna().any()
         ):
             dates = texts[index].str.replace(",", ".", regex=False)
             times = pd.to_datetime(dates, format="ISO8601", utc=True, errors="coerce")
-            numeric_table[index] = (times - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
+            numbers[index] = (times - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
             has_time_zone = bool(dates.str.contains(r"(?:Z|[+-]\d\d:?\d\d)$").mean() > 0.5)
-            column_meanings[index] = replace(meaning, unit="s")
-    return numeric_table, has_time_zone
+            meanings[index] = replace(meaning, unit="s")
+    return numbers, meanings, has_time_zone
 
 
 def _to_numbers(texts: "pd.Series[str]", *, may_have_decimal_comma: bool) -> "pd.Series[float]":
@@ -349,7 +354,9 @@ def _select_body(
     for index, meaning in enumerate(column_meanings):
         if meaning.kind == "tag":
             tags = texts[index].dropna().unique().tolist()
-            if 1 < len(tags) <= MAX_TAGS_IN_FILE or (tags and body_name is not None):
+            # A counter has many values: ignore it unless the user gave one of them
+            has_several_tags = 1 < len(tags) <= MAX_TAGS_IN_FILE
+            if has_several_tags or (tags and body_name is not None):
                 return texts[texts[index] == choose_body(table.file_name, tags, body_name)]
     if body_name is not None and not table.has_only_chosen_body:
         raise LogError(
@@ -381,19 +388,18 @@ def _find_column_indices(table: PositionTable, wanted_columns: tuple[str, ...]) 
 
 
 def _interpret_given_columns(
-    table: PositionTable, column_meanings: Sequence[ColumnMeaning], given_names: tuple[str, ...]
+    table: PositionTable,
+    column_meanings: Sequence[ColumnMeaning],
+    given_column_names: tuple[str, ...],
 ) -> list[ColumnMeaning]:
     """Return the meanings of all columns if the user gave those of time, position and sigma.
 
     The axes are x, y, z in the given order, unless the names of the given columns state the axes.
     """
-    given_columns = _find_column_indices(table, given_names)
+    given_columns = _find_column_indices(table, given_column_names)
     time_column, *position_columns = given_columns[:4]
     sigma_columns = given_columns[4:]
     kept_kinds = ("tag",) if sigma_columns else ("tag", "sigma")
-    meanings = [
-        meaning if meaning.kind in kept_kinds else ColumnMeaning() for meaning in column_meanings
-    ]
     # The names of other columns must not define the frame
     named_position = find_position_columns(
         [
@@ -401,16 +407,20 @@ def _interpret_given_columns(
             for index, meaning in enumerate(column_meanings)
         ]
     )
-    has_axis_names = named_position and {*named_position[1]} - {None} == {*position_columns}
-    for index, axis in zip(position_columns, "xyz", strict=False):
-        meaning = column_meanings[index]
-        meanings[index] = (
-            meaning if has_axis_names else ColumnMeaning("position", axis, meaning.unit)
-        )
-    for index in sigma_columns:
-        meanings[index] = ColumnMeaning("sigma", unit=column_meanings[index].unit)
-    time_unit = column_meanings[time_column].unit
-    meanings[time_column] = ColumnMeaning("time", unit=time_unit, time_kind="time")
+    has_axis_names = named_position is not None and {*position_columns} <= {*named_position[1]}
+    meanings = []
+    for index, meaning in enumerate(column_meanings):
+        used_meaning = ColumnMeaning()
+        if index == time_column:
+            used_meaning = ColumnMeaning("time", unit=meaning.unit, time_kind="time")
+        elif index in sigma_columns:
+            used_meaning = ColumnMeaning("sigma", unit=meaning.unit)
+        elif index in position_columns and not has_axis_names:
+            axis = "xyz"[position_columns.index(index)]
+            used_meaning = ColumnMeaning("position", axis, meaning.unit)
+        elif index in position_columns or meaning.kind in kept_kinds:
+            used_meaning = meaning
+        meanings.append(used_meaning)
     return meanings
 
 
@@ -419,7 +429,7 @@ def _find_axes(
 ) -> tuple[str | None, PositionColumns]:
     """Return the frame of the position (None: unknown), and the column indices of its axes."""
     frame_and_axis_columns = find_position_columns(column_meanings)
-    assert frame_and_axis_columns  # find_table returns only tables with positions
+    assert frame_and_axis_columns  # find_position_table returns only tables with positions
     frame, (x_column, y_column, z_column) = frame_and_axis_columns
     if z_column is not None and numeric_table[z_column].isna().all():
         z_column = None
@@ -462,16 +472,17 @@ def _detect_time_column(
 
 def _choose_time_unit(
     times: "pd.Series[float]",
+    frame_rate_hz: float | None,
     unit_in_column_name: str,
     given_unit: str | None,
-    units: Container[str],
-    interval_range_s: tuple[float, float],
+    plausible_intervals_s: Mapping[str, tuple[float, float]],
 ) -> tuple[str, str]:
     """Return the unit of the timestamps, and the reason for this unit.
 
-    A missing unit is detected from UNIX times, or from a plausible median interval. ``units`` are
-    the units that are tested with the median interval.
+    A missing unit is detected from UNIX times, or from a plausible median interval.
     """
+    if frame_rate_hz:
+        return "frame numbers", f"the frame rate is {frame_rate_hz:g} Hz"
     if given_unit is not None:
         return given_unit, "the unit was given with --position-time-unit"
     median_time, time_steps = times.median(), times.diff()
@@ -482,10 +493,13 @@ def _choose_time_unit(
     plausible_units = []
     for unit, unit_s in SECONDS_BY_TIME_UNIT.items():
         is_unix = MIN_VALID_UNIX_TIME_S <= median_time * unit_s < MAX_VALID_UNIX_TIME_S
-        if is_unix and median_step * unit_s <= MAX_UNIX_TIME_INTERVAL_S:
+        interval_s = median_step * unit_s
+        if is_unix and interval_s <= MAX_MEDIAN_UNIX_TIMESTAMP_INTERVAL_S:
             return unit, f"in {unit}, the timestamps are UNIX times between 2000 and 2100"
-        if unit in units and interval_range_s[0] <= median_step * unit_s <= interval_range_s[1]:
-            plausible_units.append(unit)
+        if unit in plausible_intervals_s:
+            min_interval_s, max_interval_s = plausible_intervals_s[unit]
+            if min_interval_s <= interval_s <= max_interval_s:
+                plausible_units.append(unit)
     if not plausible_units:
         return "s", (
             "px4fuse assumes seconds, because no unit gives a plausible UWB rate; set another unit "
@@ -500,46 +514,43 @@ def _choose_time_unit(
 
 
 def _choose_length_units(
-    numeric_table: pd.DataFrame,
+    positions: pd.DataFrame,
     position_columns: list[int],
     column_meanings: Sequence[ColumnMeaning],
     given_unit: str | None,
     max_extent_m: float,
-) -> tuple["pd.Series[float]", str]:
-    """Return the factor from each column's unit to metres, and the reason for the unit.
+) -> tuple[list[float], str]:
+    """Return the factor from the unit of each column to metres, and the reason for the unit.
 
     Without a unit in the column names, positions with a very large extent are in mm.
     """
-    named_units = {
-        index: meaning.unit
-        for index, meaning in enumerate(column_meanings)
-        if meaning.unit in METRES_BY_LENGTH_UNIT
-    }
+    named_units = [meaning.unit for meaning in column_meanings]
+    named_position_units = [
+        named_units[index]
+        for index in position_columns
+        if named_units[index] in METRES_BY_LENGTH_UNIT
+    ]
     # The range from 5 % to 95 % excludes outliers
-    extents = numeric_table[position_columns].quantile(0.95) - numeric_table[
-        position_columns
-    ].quantile(0.05)
-    max_extent = extents.max()
-    unit = "m"
+    extents = positions.quantile(0.95) - positions.quantile(0.05)
+    largest_extent = extents.max()
+    default_unit = "m"
     reason = "px4fuse assumes metres, because the column names contain no unit"
     if given_unit is not None:
-        unit, named_units = given_unit, {}
+        named_units = [given_unit] * len(named_units)
         reason = "the unit was given with --position-unit"
-    elif units := [named_units[index] for index in position_columns if index in named_units]:
-        unit = units[0]
+    elif named_position_units:
+        default_unit = named_position_units[0]
         reason = "the column names contain the unit"
-    elif max_extent_m < max_extent <= max_extent_m / METRES_BY_LENGTH_UNIT["mm"]:
-        unit = "mm"
+    elif max_extent_m < largest_extent <= max_extent_m / METRES_BY_LENGTH_UNIT["mm"]:
+        default_unit = "mm"
         reason = (
-            f"an extent of {max_extent:.0f} m is too large for an indoor flight; if the unit is "
-            "cm, give --position-unit"
+            f"an extent of {largest_extent:.0f} m is too large for an indoor flight; if the unit "
+            "is cm, give --position-unit"
         )
-    column_units = pd.Series(
-        {index: named_units.get(index, unit) for index in map(int, numeric_table.columns)}
-    )
-    metres_per_unit = column_units.map(METRES_BY_LENGTH_UNIT)
-    extent_m = (extents * metres_per_unit).max()
-    units_text = ", ".join(dict.fromkeys(column_units[position_columns]))
+    units = [unit if unit in METRES_BY_LENGTH_UNIT else default_unit for unit in named_units]
+    metres_per_unit = [METRES_BY_LENGTH_UNIT[unit] for unit in units]
+    extent_m = max(extents[index] * metres_per_unit[index] for index in position_columns)
+    units_text = ", ".join(dict.fromkeys(units[index] for index in position_columns))
     return (
         metres_per_unit,
         f"{units_text} ({reason}); 90 % of the positions are within {extent_m:.3g} m",

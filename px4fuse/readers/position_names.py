@@ -72,24 +72,30 @@ def read_column_name(name: str) -> ColumnMeaning:
     """Find quantity, axis and unit in a column name."""
     snake_case_name = unicodedata.normalize("NFKC", name).replace("μ", "u")
     snake_case_name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", snake_case_name).lower()
-    *column_words, last_word = re.findall(r"[^\W_]+", snake_case_name) or [""]
-    unit = _UNIT_BY_WORD.get(last_word, "")
-    if not column_words and unit in SECONDS_BY_TIME_UNIT and len(last_word) > 2:
+    words = re.findall(r"[^\W_]+", snake_case_name) or [""]
+    unit = _UNIT_BY_WORD.get(words[-1], "")
+    if unit and len(words) > 1:
+        words.pop()
+    elif unit in SECONDS_BY_TIME_UNIT and len(words[0]) > 2:
         # a unit alone, such as "sec", is a time
         return ColumnMeaning("time", unit=unit, time_kind="time")
-    if not column_words or not unit:
-        column_words, unit = [*column_words, last_word], ""
-    word_set = {*column_words}
+    else:
+        unit = ""
+    word_set = {*words}
     is_time = bool(word_set & _WORDS_BY_ROLE["time"]) and word_set <= _TIME_WORDS
     if is_time and unit not in METRES_BY_LENGTH_UNIT:
-        rank = 2 if word_set & _WORDS_BY_ROLE["recorded"] else 1
-        rank = 0 if word_set & _WORDS_BY_ROLE["measured"] else rank
-        return ColumnMeaning("time", unit=unit, time_kind=TIME_KINDS[rank])
+        time_kind = "time"
+        if word_set & _WORDS_BY_ROLE["measured"]:
+            time_kind = "time of measurement"
+        elif word_set & _WORDS_BY_ROLE["recorded"]:
+            time_kind = "time of recording"
+        return ColumnMeaning("time", unit=unit, time_kind=time_kind)
     if word_set <= _WORDS_BY_ROLE["tag"]:
         return ColumnMeaning("tag")
     sigma_and_context_words = _WORDS_BY_ROLE["sigma"] | _WORDS_BY_ROLE["context"]
+    # Split words such as "px" into position and axis
     split_words: list[str] = []
-    for word in column_words:
+    for word in words:
         match = _NAME_WITHOUT_SEPARATOR_PATTERN.fullmatch(word)
         if match and word not in sigma_and_context_words:
             split_words += filter(None, match.groups())
@@ -97,6 +103,7 @@ def read_column_name(name: str) -> ColumnMeaning:
             split_words.append(word)
     axes = [_AXIS_BY_WORD[word] for word in split_words if word in _AXIS_BY_WORD]
     other_words = [word for word in split_words if word not in _AXIS_BY_WORD]
+    # Positions and σ have at most one axis, and no unknown word
     is_known = (
         unit not in SECONDS_BY_TIME_UNIT
         and len(axes) <= 1
@@ -116,17 +123,23 @@ def find_position_columns(
 
     Return None if no column contains a position.
     """
-    columns_by_name: dict[str, dict[str, int]] = {}
+    column_by_name_and_axis: dict[str, dict[str, int]] = {}
     for index, column in enumerate(column_meanings):
         if column.kind == "position":
-            columns_by_axis = columns_by_name.setdefault(column.name_without_axis_and_unit, {})
+            columns_by_axis = column_by_name_and_axis.setdefault(
+                column.name_without_axis_and_unit, {}
+            )
             columns_by_axis.setdefault(column.axis, index)
     for axis_count in (3, 2):
-        for axes in columns_by_name.values():
-            # x, y, z, w is a quaternion
-            for frame, names in () if "w" in axes else _AXIS_NAMES_BY_FRAME:
-                if {*names[:axis_count]} <= axes.keys():
-                    return frame, (axes[names[0]], axes[names[1]], axes.get(names[2]))
+        for columns_by_axis in column_by_name_and_axis.values():
+            for frame, axes in _AXIS_NAMES_BY_FRAME:
+                # x, y, z, w is a quaternion
+                if {*axes[:axis_count]} <= columns_by_axis.keys() and "w" not in columns_by_axis:
+                    return frame, (
+                        columns_by_axis[axes[0]],
+                        columns_by_axis[axes[1]],
+                        columns_by_axis.get(axes[2]),
+                    )
     return None
 
 

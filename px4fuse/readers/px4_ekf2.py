@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from px4fuse.core.arrays import Array, IntArray, compute_median_interval_s
-from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, FLOW, fill_with_defaults
+from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, FLOW, fill_parameters_with_defaults
 from px4fuse.flight.model import (
     BIAS_NOT_LOGGED,
     EKF2_STEP_S,
@@ -28,7 +28,7 @@ from px4fuse.flight.model import (
     sample_step_function,
     time_index,
 )
-from px4fuse.readers.common import Layout
+from px4fuse.readers.common import MessageLayout
 from px4fuse.readers.px4_innovations import (
     collect_innovations_by_axis,
     read_aids,
@@ -46,19 +46,17 @@ from px4fuse.readers.px4_topics import (
     STATUS_TOPIC,
     TOPIC_LAYOUTS,
 )
-from px4fuse.readers.ulog_topics import Topics, measurement_time_us
+from px4fuse.readers.ulog_topics import Topics, get_measurement_times_us
 
 VISION_TOPIC = "vehicle_visual_odometry"
 # Fields of vehicle_local_position that are 1 while the horizontal position is valid
 VALIDITY_FLAGS = ("xy_valid", "xy_global")
-# Number of EKF2 states that are read; wind and terrain are not read
-STATE_COUNT = 22
 # Bit of filter_control_status_u (common.h) for fusion of the 3D magnetic field
 MAG_3D_FUSION_BIT = 5
 # Minimum rate (Hz) of a complete magnetometer log; EKF2 uses 14 Hz
 MIN_MAGNETOMETER_HZ = 10.0
 # Distance from a half-integer at which the rounding of an interval ratio is ambiguous
-MAX_DISTANCE_FROM_HALF_INTEGER = 0.05
+MAX_INTERVAL_RATIO_DISTANCE_FROM_HALF_INTEGER = 0.05
 # Maximum interval (s) for the inversion of EKF2's low-pass filter of optical flow
 MAX_FLOW_INTERVAL_S = 0.5
 # Aiding sources of horizontal position and velocity, without external vision position
@@ -109,7 +107,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     topics.record_stream("ekf2_state", LOCAL_POSITION_LAYOUT.topic)
     aid_enabled_flags = read_enabled_aids(topics)
     fusion_flags = _read_fusion_flags(topics, aid_enabled_flags)
-    vision_gate = fill_with_defaults(parameters)[EV_POS.gate]
+    vision_gate = fill_parameters_with_defaults(parameters)[EV_POS.gate]
     aids = read_aids(topics, aid_enabled_flags)
     innovations, innovation_topics = collect_innovations_by_axis(aids, fusion_flags, vision_gate)
     if innovation_topics:
@@ -126,7 +124,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     failed_gnss_checks = topics.primary_samples(TOPIC_LAYOUTS["gnss_checks"])["failed"].dropna()
     if len(failed_gnss_checks):
         status_flags["failed_checks"] = failed_gnss_checks
-    step_s = _estimate_step_s(topics)
+    step_s = _estimate_prediction_interval_s(topics)
     horizon_state = _read_horizon_state(topics, step_s)
     return Ekf2(
         state=state,
@@ -182,7 +180,8 @@ def _find_state_vector(topics: Topics) -> tuple[str, int]:
 def _read_horizon_state(topics: Topics, step_s: float) -> TableOrUnavailable:
     """Read EKF2's state and variances at the fusion horizon.
 
-    Older PX4 releases log IMU biases per prediction. They are divided by the interval ``step_s``.
+    Older PX4 releases log variances of the quaternion, and IMU biases per prediction. The biases
+    are divided by the interval ``step_s``.
     """
     topic, attitude_variance_count = _find_state_vector(topics)
     if not topic:
@@ -193,23 +192,23 @@ def _read_horizon_state(topics: Topics, step_s: float) -> TableOrUnavailable:
             f"no supported PX4 release has states and covariances of these lengths in {topic}",
             "Report the PX4 version in an issue of px4fuse.",
         )
-    state_fields = [f"states[{i}]" for i in range(STATE_COUNT)]
-    variance_fields = [
-        f"covariances[{i}]" for i in range(STATE_COUNT - 4 + attitude_variance_count)
-    ]
-    layout = Layout(topic, {name: name for name in state_fields + variance_fields})
-    samples = topics.primary_samples(layout).dropna()
-    samples = samples[(samples[variance_fields] >= 0.0).all(axis=1)]
-    state = samples[state_fields].to_numpy(copy=True)
-    variance = samples[variance_fields].to_numpy(copy=True)
-    if attitude_variance_count == QUATERNION_VARIANCE_COUNT:
-        state[:, 10:16] /= step_s
-        variance = np.hstack(
-            [_convert_attitude_variance(state[:, :4], variance[:, :4]), variance[:, 4:]]
+    has_quaternion_variances = attitude_variance_count == QUATERNION_VARIANCE_COUNT
+    variance_columns = Columns.FUSION_HORIZON_VARIANCE
+    if has_quaternion_variances:
+        quaternion_variances = [f"{component}_variance" for component in Columns.QUATERNION]
+        variance_columns = quaternion_variances + Columns.FUSION_HORIZON_VARIANCE[3:]
+    fields = {name: f"states[{i}]" for i, name in enumerate(Columns.FUSION_HORIZON_STATE)}
+    fields |= {name: f"covariances[{i}]" for i, name in enumerate(variance_columns)}
+    samples = topics.primary_samples(MessageLayout(topic, fields)).dropna()
+    samples = samples[(samples[variance_columns] >= 0.0).all(axis=1)].copy()
+    if has_quaternion_variances:
+        biases = Columns.GYRO_BIAS + Columns.ACCELEROMETER_BIAS
+        samples[biases] /= step_s
+        samples[[f"{bias}_squared" for bias in biases]] /= step_s**2
+        samples[Columns.FUSION_HORIZON_VARIANCE[:3]] = _convert_attitude_variance(
+            samples[Columns.QUATERNION].to_numpy(), samples[quaternion_variances].to_numpy()
         )
-        variance[:, 9:15] /= step_s**2
-    columns = Columns.FUSION_HORIZON_STATE + Columns.FUSION_HORIZON_VARIANCE
-    return pd.DataFrame(np.hstack([state, variance]), index=samples.index, columns=columns)
+    return samples[Columns.FUSION_HORIZON_STATE + Columns.FUSION_HORIZON_VARIANCE]
 
 
 def configured_step_s(topics: Topics) -> float:
@@ -217,16 +216,18 @@ def configured_step_s(topics: Topics) -> float:
     return topics.log.parameters.get("EKF2_PREDICT_US", EKF2_STEP_S * 1e6) * 1e-6
 
 
-def _estimate_step_s(topics: Topics) -> float:
+def _estimate_prediction_interval_s(topics: Topics) -> float:
     """Return EKF2's actual prediction interval (s), a multiple of the IMU interval."""
     configured_interval_s = configured_step_s(topics)
-    imu_time_s = topics.read(Layout(IMU_LAYOUT.topic, {"time": "timestamp"})).index.to_numpy()
+    imu_time_s = topics.read(
+        MessageLayout(IMU_LAYOUT.topic, {"time": "timestamp"})
+    ).index.to_numpy()
     if (
         len(imu_time_s) < 2
         or (interval_s := compute_median_interval_s(imu_time_s)) >= configured_interval_s
     ):
         return configured_interval_s
-    layout = Layout(_find_state_vector(topics)[0], {"states[0]": "states[0]"})
+    layout = MessageLayout(_find_state_vector(topics)[0], {"states[0]": "states[0]"})
     imu_rows_at_prediction_ends = find_rows_of_timestamps(
         imu_time_s, topics.primary_samples(layout).index
     )
@@ -243,7 +244,7 @@ def _estimate_step_s(topics: Topics) -> float:
 def find_rows_of_timestamps(times_s: Array, wanted_times_s: ArrayLike) -> IntArray:
     """Return the indices of ``times_s`` (increasing) that equal a wanted time, rounded to 1 µs."""
     times_us, wanted_times_us = (
-        np.rint(np.asarray(times, float) * 1e6) for times in (times_s, wanted_times_s)
+        np.rint(np.multiply(times, 1e6)) for times in (times_s, wanted_times_s)
     )
     rows = np.searchsorted(times_us, wanted_times_us)
     is_inside = rows < len(times_us)
@@ -268,10 +269,10 @@ def compute_samples_per_step(
     interval_ratio = configured_step_s / imu_interval_s
     # 1e-6 compensates rounding errors of the IMU interval
     sample_count = max(int(interval_ratio + 0.5 + 1e-6), 1)
-    samples_between_logged_ends = np.diff(np.asarray(step_ends))
+    samples_between_logged_ends = np.diff(step_ends)
     if (
         sample_count > 1
-        and abs(interval_ratio + 0.5 - sample_count) < MAX_DISTANCE_FROM_HALF_INTEGER
+        and abs(interval_ratio + 0.5 - sample_count) < MAX_INTERVAL_RATIO_DISTANCE_FROM_HALF_INTEGER
         and len(samples_between_logged_ends)
     ):
         fits_larger_count, fits_smaller_count = (
@@ -307,7 +308,7 @@ def _compute_publication_delay_s(topics: Topics, topic: str) -> pd.Series:
     """Return the delay (s) from measurement to publication, indexed by measurement time (s)."""
     for table in topics.tables_of(topic)[:1]:
         if "timestamp_sample" in table:
-            sample_times_us = measurement_time_us(table)
+            sample_times_us = get_measurement_times_us(table)
             delay_us = table["timestamp"].astype(np.int64) - sample_times_us
             sample_times_s = (sample_times_us - topics.time_origin_us) * 1e-6
             return pd.Series(delay_us * 1e-6, time_index(sample_times_s))
@@ -407,8 +408,8 @@ def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
     delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     observations = observations.set_axis(observations.index + delay_s)
     field = max(magnetometer, observations, key=len)
-    is_incomplete = len(field) <= MIN_MAGNETOMETER_HZ * topics.log.duration_s
-    if is_incomplete and Columns.MAGNETIC_FIELD_INNOVATION[0] in observations:
+    is_field_log_incomplete = len(field) <= MIN_MAGNETOMETER_HZ * topics.log.duration_s
+    if is_field_log_incomplete and Columns.MAGNETIC_FIELD_INNOVATION[0] in observations:
         field = observations
     control_bits = topics.read(TOPIC_LAYOUTS["control_bits"])["bits"].dropna()
     if field.empty or control_bits.empty:
@@ -436,19 +437,21 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     filtered_velocity = flow_velocity[["forward_m_s", "right_m_s"]]
     previous_part = filtered_velocity.shift().mul(previous_output_weight, axis=0)
     flow = (filtered_velocity - previous_part).div(1.0 - previous_output_weight, axis=0)
+    # The noise is logged in rad/s. The range to the ground, velocity ÷ flow rate of the newest
+    # sample, converts it to m/s
     newest_velocity = flow_velocity[["newest_forward_m_s", "newest_right_m_s"]]
-    squared_ground_distance_m2 = (newest_velocity**2).sum(axis=1) / (
-        flow_velocity[["x_rad_s", "y_rad_s"]] ** 2
-    ).sum(axis=1)
+    flow_rate = flow_velocity[["x_rad_s", "y_rad_s"]]
+    squared_range_m2 = (newest_velocity**2).sum(axis=1) / (flow_rate**2).sum(axis=1)
+    noise_rad2_s2 = np.interp(flow.index, flow_noise.index, flow_noise["noise"])
     flow = flow.assign(
         samples=sample_count,
         interval_s=interval_s,
-        noise_m2_s2=squared_ground_distance_m2
-        * np.interp(flow.index, flow_noise.index, flow_noise["noise"]),
+        noise_m2_s2=squared_range_m2 * noise_rad2_s2,
     )
     is_used = (steps_s > 0.5 * interval_s) & (steps_s <= MAX_FLOW_INTERVAL_S)
     if FLOW.name in enabled_aids:
         is_used &= sample_step_function(enabled_aids[FLOW.name], flow.index) > 0.0
+    # The range is infinite if the flow rate is zero
     return flow[is_used].replace(np.inf, np.nan).dropna()
 
 

@@ -92,48 +92,45 @@ def reconstruct_fixes(
     # EKF2 fuses a fix that is older than the fusion horizon at the horizon (RingBuffer.h)
     delay_beyond_horizon_s = max(0.0, delay_s - ekf2.horizon_s)
     fusion_times_s = north_innovations.index.to_numpy() - delay_beyond_horizon_s
-    # Each innovation belongs to the latest fix before it, logged or not
+    # The receiver sends fixes at multiples of its interval after each logged fix. An innovation
+    # belongs to the latest of them
     previous_fix_index = np.searchsorted(logged_fix_times_s, fusion_times_s) - 1
-    intervals_since_logged_fix = (
-        fusion_times_s - logged_fix_times_s[previous_fix_index]
-    ) / receiver_interval_s
-    is_between_fixes = (previous_fix_index >= 0) & (
-        previous_fix_index < len(logged_fix_times_s) - 1
+    interval_count, interval_fraction = np.divmod(
+        (fusion_times_s - logged_fix_times_s[previous_fix_index]) / receiver_interval_s, 1.0
     )
-    # An innovation immediately after a fix may belong to the previous fix
-    has_unique_fix = is_between_fixes & (
-        intervals_since_logged_fix % 1.0 > ekf2.step_s / receiver_interval_s
+    rows = np.flatnonzero(
+        (previous_fix_index >= 0)
+        & (previous_fix_index < len(logged_fix_times_s) - 1)
+        # An innovation immediately after a fix may belong to the fix before it
+        & (interval_fraction > ekf2.step_s / receiver_interval_s)
     )
-    previous_fix_index = previous_fix_index[has_unique_fix]
-    intervals_since_logged_fix = np.floor(intervals_since_logged_fix[has_unique_fix])
-    reconstructed_fix_times_s = (
-        logged_fix_times_s[previous_fix_index] + intervals_since_logged_fix * receiver_interval_s
-    )
+    previous_fix_index, interval_count = previous_fix_index[rows], interval_count[rows]
+    fix_times_s = logged_fix_times_s[previous_fix_index] + interval_count * receiver_interval_s
     reconstructed_fixes = pd.DataFrame(
         {
             column: interpolate_inside_time_span(
-                reconstructed_fix_times_s + delay_beyond_horizon_s, ekf2.state[column]
+                fix_times_s + delay_beyond_horizon_s, ekf2.state[column]
             )
-            + innovations["innovation_m"].to_numpy()[has_unique_fix]
-            for column, innovations in zip(
-                Columns.POSITION, (north_innovations, east_innovations), strict=False
+            + innovations["innovation_m"].to_numpy()[rows]
+            for column, innovations in (
+                ("north_m", north_innovations),
+                ("east_m", east_innovations),
             )
         },
-        index=time_index(reconstructed_fix_times_s),
+        index=time_index(fix_times_s),
     )
-    is_logged = intervals_since_logged_fix == 0.0
-    position_error = (
-        reconstructed_fixes - fixes[reconstructed_fixes.columns].to_numpy()[previous_fix_index]
-    )
-    position_error = position_error[is_logged].dropna()
+    # Logged fixes show the error of the reconstruction
+    is_logged = interval_count == 0.0
+    previous_fixes = fixes[reconstructed_fixes.columns].to_numpy()[previous_fix_index]
+    position_errors_m = (reconstructed_fixes - previous_fixes)[is_logged].dropna().to_numpy()
     reconstructed_fixes = reconstructed_fixes[~is_logged].dropna()
     reconstructed_fixes = reconstructed_fixes[~reconstructed_fixes.index.duplicated()]
-    if len(position_error) < MIN_LOGGED_FIXES or reconstructed_fixes.empty:
+    if len(position_errors_m) < MIN_LOGGED_FIXES or reconstructed_fixes.empty:
         return empty_result
-    rms_error_m = rms(position_error.to_numpy())
+    rms_error_m = rms(position_errors_m)
     if rms_error_m > MAX_FIX_RECONSTRUCTION_ERROR_M:
         return empty_result
-    for column in (Columns.POSITION[2], *Columns.POSITION_VARIANCE):
+    for column in ("down_m", *Columns.POSITION_VARIANCE):
         reconstructed_fixes[column] = np.interp(
             reconstructed_fixes.index, logged_fix_times_s, fixes[column]
         )
@@ -155,16 +152,16 @@ def _estimate_receiver_interval(fix_times_s: Array) -> float | None:
     is_possible = percentile_98_of_deviation_s <= MAX_DEVIATION_FROM_INTERVAL_MULTIPLE_S
     if not np.any(is_possible):
         return None
-    longest_interval_s = CANDIDATE_FIX_INTERVALS_S[is_possible][-1]
+    longest_interval_s = CANDIDATE_FIX_INTERVALS_S[is_possible].max()
     # Best fit among the candidates within 10 % of the longest possible interval
     is_near_longest = (
         np.abs(CANDIDATE_FIX_INTERVALS_S - longest_interval_s) < 0.1 * longest_interval_s
     )
     best_index = np.argmin(np.where(is_near_longest, percentile_98_of_deviation_s, np.inf))
     interval_multiples = np.round(logged_intervals_s / CANDIDATE_FIX_INTERVALS_S[best_index])
-    has_enough_intervals_by_multiple = (
-        np.bincount(interval_multiples.astype(int)) >= MIN_LOGGED_INTERVALS_PER_MULTIPLE
-    )
-    if not np.any(has_enough_intervals_by_multiple[1:] & has_enough_intervals_by_multiple[:-1]):
+    is_frequent = np.bincount(interval_multiples.astype(int)) >= MIN_LOGGED_INTERVALS_PER_MULTIPLE
+    # Two successive multiples have no common divisor. With a common divisor, such as 2 and 4, the
+    # interval could also be twice as long
+    if not np.any(is_frequent[1:] & is_frequent[:-1]):
         return None
     return float(np.median(logged_intervals_s / interval_multiples))

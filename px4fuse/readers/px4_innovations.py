@@ -24,11 +24,11 @@ from px4fuse.flight.model import (
     sample_step_function,
 )
 from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.common import Layout, assign_fields_to_columns, join_nearest
+from px4fuse.readers.common import MessageLayout, assign_fields_to_columns, join_nearest_samples
 from px4fuse.readers.ulog_topics import Topics
 
 # Maximum time (s) between innovation and variance S; PX4 logs them every 0.5 s by default
-MAX_VARIANCE_TIME_DIFFERENCE_S = 0.6
+MAX_TIME_FROM_INNOVATION_TO_VARIANCE_S = 0.6
 # Column and PX4 field for the time of the last fusion
 LAST_FUSION_FIELD = {"last_fused_us": "time_last_fuse"}
 # Optional fields of the topics estimator_aid_src_*, by aiding source and column
@@ -41,56 +41,60 @@ Innovations = dict[NedAxis, TableOrUnavailable]
 
 
 @dataclass(frozen=True)
-class Ekf2PositionSource:
-    """Position source (external vision or GNSS) and its EKF2 aiding sources."""
+class Ekf2Measurement:
+    """Horizontal position or height that EKF2 can fuse, and its aiding source."""
 
-    name: str
-    # PX4's names of the aiding sources for horizontal position and height
-    horizontal_aid: str
-    vertical_aid: str
-    # Advice to enable fusion, for "horizontal" and "vertical" position
-    remedies: Mapping[str, str]
+    # PX4's name of the aiding source
+    aid: str
+    # Name of the sensor
+    sensor: str
+    # Advice to enable fusion
+    fusion_remedy: str
     # Advice if the innovations are not logged
-    logging_remedy: str
-    # Name of a separate height sensor, if any
-    height_sensor: str = ""
+    logging_remedy: str = px4.DEFAULT_PROFILE_REMEDY
 
 
-VISION = Ekf2PositionSource(
-    name="external vision",
-    horizontal_aid="ev_pos",
-    vertical_aid="ev_hgt",
-    remedies={
+# Position source with its measurements, "horizontal" and "vertical"
+Ekf2PositionSource = Mapping[str, Ekf2Measurement]
+_VISION_LOGGING_REMEDY = "Record with SDLOG_PROFILE 129 (default and vision)."
+VISION: Ekf2PositionSource = {
+    "horizontal": Ekf2Measurement(
+        "ev_pos",
+        "external vision",
         # EKF2 starts fusion of vision at sample intervals below 0.2 s (ev_control.cpp)
-        "horizontal": "Send the position at 10 Hz or more (EKF2 starts fusion at intervals below "
-        "0.2 s) and set bit 0 of EKF2_EV_CTRL (bit 3 of EKF2_AID_MASK before v1.14).",
-        "vertical": "Set bit 1 of EKF2_EV_CTRL (EKF2_HGT_MODE 3 before v1.14) to fuse the height "
-        "of the source.",
-    },
-    logging_remedy="Record with SDLOG_PROFILE 129 (default and vision).",
-)
-GNSS = Ekf2PositionSource(
-    name="GNSS",
-    horizontal_aid="gnss_pos",
-    vertical_aid="gnss_hgt",
-    remedies={
-        "horizontal": "Set bit 0 of EKF2_GPS_CTRL (bit 0 of EKF2_AID_MASK before v1.14), and wait "
-        "for a fix that passes EKF2's checks.",
-        "vertical": "Set bit 1 of EKF2_GPS_CTRL (EKF2_HGT_MODE 1 before v1.14) to fuse the GNSS "
-        "height.",
-    },
-    logging_remedy=px4.DEFAULT_PROFILE_REMEDY,
-)
-GNSS_WITH_BAROMETER_HEIGHT = replace(
-    GNSS,
-    vertical_aid=BAROMETER.name,
-    height_sensor="the barometer",
-    remedies={
-        **GNSS.remedies,
-        "vertical": "Set EKF2_BARO_CTRL to 1 (EKF2_HGT_MODE to 0 before v1.14) to fuse the "
-        "barometer height.",
-    },
-)
+        "Send the position at 10 Hz or more (EKF2 starts fusion at intervals below 0.2 s) and set "
+        "bit 0 of EKF2_EV_CTRL (bit 3 of EKF2_AID_MASK before v1.14).",
+        _VISION_LOGGING_REMEDY,
+    ),
+    "vertical": Ekf2Measurement(
+        "ev_hgt",
+        "external vision",
+        "Set bit 1 of EKF2_EV_CTRL (EKF2_HGT_MODE 3 before v1.14) to fuse the height of the "
+        "source.",
+        _VISION_LOGGING_REMEDY,
+    ),
+}
+GNSS: Ekf2PositionSource = {
+    "horizontal": Ekf2Measurement(
+        "gnss_pos",
+        "GNSS",
+        "Set bit 0 of EKF2_GPS_CTRL (bit 0 of EKF2_AID_MASK before v1.14), and wait for a fix that "
+        "passes EKF2's checks.",
+    ),
+    "vertical": Ekf2Measurement(
+        "gnss_hgt",
+        "GNSS",
+        "Set bit 1 of EKF2_GPS_CTRL (EKF2_HGT_MODE 1 before v1.14) to fuse the GNSS height.",
+    ),
+}
+GNSS_WITH_BAROMETER_HEIGHT: Ekf2PositionSource = {
+    **GNSS,
+    "vertical": Ekf2Measurement(
+        BAROMETER.name,
+        "the barometer",
+        "Set EKF2_BARO_CTRL to 1 (EKF2_HGT_MODE to 0 before v1.14) to fuse the barometer height.",
+    ),
+}
 
 
 def has_fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
@@ -102,30 +106,25 @@ def has_fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
             return bool(aid_log.samples["fused"].any())
         if aid_log.enabled is not None:
             return True
-    # a valid global position shows that EKF2 fused GNSS
-    if (
-        aid != GNSS_POS.name
-        or "tilt_align" in ekf2.status_flags
-        or "xy_global" not in ekf2.status_flags
-    ):
-        return False
-    return bool(ekf2.status_flags["xy_global"].any())
+    flags = ekf2.status_flags
+    # Without status flags of EKF2 (such as tilt_align), a valid global position shows that EKF2
+    # fused GNSS
+    if aid == GNSS_POS.name and "tilt_align" not in flags and "xy_global" in flags:
+        return bool(flags["xy_global"].any())
+    return False
 
 
 def replace_vision_by_gnss_innovations(ekf2: Ekf2, source: Ekf2PositionSource = GNSS) -> Ekf2:
     """Return the EKF2 data with innovations of GNSS instead of external vision."""
     enabled_flags = {
-        group: ekf2.status_flags[name]
-        for group, name in (
-            ("horizontal", source.horizontal_aid),
-            ("vertical", source.vertical_aid),
-        )
-        if name in ekf2.status_flags
+        axis_group: ekf2.status_flags[measurement.aid]
+        for axis_group, measurement in source.items()
+        if measurement.aid in ekf2.status_flags
     }
     fusion_flags: TableOrUnavailable = Unavailable(
         "EKF2 fusion flags",
         "the log does not contain the fusion flags of GNSS",
-        GNSS.logging_remedy,
+        px4.DEFAULT_PROFILE_REMEDY,
     )
     if enabled_flags:
         flags = pd.DataFrame(enabled_flags).ffill().bfill()
@@ -155,28 +154,29 @@ def collect_innovations_by_axis(
     used_topics: dict[str, None] = {}
     for axis in AXIS_NAMES:
         axis_group, quantity = "horizontal", "horizontal position"
-        aid_name, sensor_name = source.horizontal_aid, source.name
         if axis == "down":
             axis_group, quantity = "vertical", "height"
-            aid_name, sensor_name = source.vertical_aid, source.height_sensor or source.name
-        remedy = source.logging_remedy
+        measurement = source[axis_group]
+        missing_data = f"EKF2 innovations, {axis}"
+        aid_log = aids.get(measurement.aid)
         if isinstance(fusion_flags, pd.DataFrame) and not fusion_flags[axis_group].any():
-            reason = f"EKF2 never fused the {quantity} from {sensor_name} in this log"
-            remedy = source.remedies[axis_group]
-        elif (aid_log := aids.get(aid_name)) is None or (
-            axis_innovations := select_axis_innovations(aid_log, axis, gate)
-        ).empty:
-            reason = (
-                f"the log has no usable innovation of {sensor_name} in "
-                f"estimator_aid_src_{source.horizontal_aid}, "
-                f"estimator_aid_src_{source.vertical_aid}, estimator_innovations or "
-                "ekf2_innovations"
+            innovations[axis] = Unavailable(
+                missing_data,
+                f"EKF2 never fused the {quantity} from {measurement.sensor} in this log",
+                measurement.fusion_remedy,
             )
-        else:
+        elif aid_log and len(axis_innovations := select_axis_innovations(aid_log, axis, gate)):
             innovations[axis] = axis_innovations
             used_topics |= dict.fromkeys(aid_log.topics)
-            continue  # the innovations are available
-        innovations[axis] = Unavailable(f"EKF2 innovations, {axis}", reason, remedy)
+        else:
+            innovations[axis] = Unavailable(
+                missing_data,
+                f"the log has no usable innovation of {measurement.sensor} in "
+                f"estimator_aid_src_{source['horizontal'].aid}, "
+                f"estimator_aid_src_{source['vertical'].aid}, estimator_innovations or "
+                "ekf2_innovations",
+                measurement.logging_remedy,
+            )
     return innovations, tuple(used_topics)
 
 
@@ -214,44 +214,47 @@ def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
     Since v1.14, each aiding source has a topic ``estimator_aid_src_...``. Older topics contain all
     aiding sources, and repeat each innovation until the next fusion.
     """
-    log_by_aid = {}
+    aid_log_by_name = {}
     for name, aid in AIDS.items():
         enabled_flag = enabled_aids.get(name)
         aid_log = _read_aid_topic(topics, aid, enabled_flag)
-        # Older topics contain wrong values of a source while its fusion is disabled
-        if aid_log is None and (
-            name.startswith("ev_") if enabled_flag is None else enabled_flag.any()
-        ):
-            aid_log = _read_common_topics(topics, aid, enabled_flag)
+        if aid_log is None:
+            # Older topics contain wrong values of a source while its fusion is disabled. Without
+            # flags, px4fuse assumes that EKF2 fused external vision only
+            may_be_fused = name.startswith("ev_") if enabled_flag is None else enabled_flag.any()
+            if may_be_fused:
+                aid_log = _read_common_topics(topics, aid, enabled_flag)
         if aid_log is not None:
-            log_by_aid[name] = aid_log
-    return log_by_aid
+            aid_log_by_name[name] = aid_log
+    return aid_log_by_name
 
 
 def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     """Return a time series for each aiding source: 1 while its fusion is enabled, otherwise 0."""
     all_aids = (*AIDS.values(), *STATUS_FLAGS.values())
-    layout = Layout(
-        px4.STATUS_FLAGS_TOPIC,
-        optional_columns={
-            flag: flag for aid in all_aids for group in aid.flags for flag in group.split("|")
-        },
-        is_step_function=True,
+    flag_names = {flag for aid in all_aids for group in aid.flags for flag in group.split("|")}
+    flags = topics.primary_samples(
+        MessageLayout(
+            px4.STATUS_FLAGS_TOPIC,
+            optional_columns={name: name for name in flag_names},
+            is_step_function=True,
+        )
     )
-    flags = topics.primary_samples(layout)
+    bits = topics.primary_samples(px4.TOPIC_LAYOUTS["control_bits"])["bits"].dropna()
     enabled_aids = {}
-    for aid in all_aids if len(flags) else ():
-        groups = (group.split("|") for group in aid.flags)
-        group = next((group for group in groups if {*group} <= {*flags}), None)
-        if group is not None:
-            enabled_aids[aid.name] = flags[group].max(axis=1)
-    if not flags.columns.empty:
-        return enabled_aids
-    control_bits = topics.primary_samples(px4.TOPIC_LAYOUTS["control_bits"])["bits"].dropna()
-    for aid in all_aids if len(control_bits) else ():
-        if aid.status_bit is not None:
-            is_enabled = control_bits.astype(np.int64) & (1 << aid.status_bit) > 0
-            enabled_aids[aid.name] = is_enabled.astype(float)
+    for aid in all_aids:
+        if flags.columns.empty:  # PX4 before v1.12
+            if aid.status_bit is not None and len(bits):
+                is_enabled = bits.astype(np.int64) & (1 << aid.status_bit) > 0
+                enabled_aids[aid.name] = is_enabled.astype(float)
+            continue
+        # The names of flags depend on the PX4 release: the first group that is logged is used. The
+        # aid is enabled while any flag of the group is set
+        for group in aid.flags:
+            names = group.split("|")
+            if {*names} <= {*flags} and len(flags):
+                enabled_aids[aid.name] = flags[names].max(axis=1)
+                break
     return enabled_aids
 
 
@@ -269,7 +272,9 @@ def _read_aid_topic(
     columns = {"fused": "fused", "rejected": "innovation_rejected"}
     for name, field in field_by_quantity.items():
         columns |= _assign_fields_by_axis(name, aid, field + "[]" * (len(aid.axes) > 1))
-    layout = Layout(f"estimator_aid_src_{aid.name}", columns, OPTIONAL_FIELDS.get(aid.name, {}))
+    layout = MessageLayout(
+        f"estimator_aid_src_{aid.name}", columns, OPTIONAL_FIELDS.get(aid.name, {})
+    )
     if topics.find_layout(layout) is None:  # return early: reading an empty table takes time
         return None
     samples = topics.primary_samples(layout).dropna()
@@ -284,41 +289,44 @@ def _read_common_topics(
     topics: Topics, aid: Aid, enabled_flag: pd.Series[float] | None
 ) -> AidLog | None:
     """Read the innovations of an aiding source from a topic that contains all aiding sources."""
+    # If the flag cs_mag is logged, the innovation "heading" is that of a field component in gauss
     is_in_gauss = aid.name == "mag_heading" and any(
         "cs_mag" in table for table in topics.tables_of(px4.STATUS_FLAGS_TOPIC)
     )
-    layouts = []
+    possible_layouts = []
     if aid.fields and not is_in_gauss:
-        layouts.append(
+        innovation_topic, variance_topic = px4.INNOVATION_TOPICS
+        possible_layouts.append(
             [
-                Layout(topic, _assign_fields_by_axis(name, aid, aid.fields))
-                for topic, name in zip(
-                    px4.INNOVATION_TOPICS, ("innovation", "variance"), strict=True
-                )
+                MessageLayout(
+                    innovation_topic, _assign_fields_by_axis("innovation", aid, aid.fields)
+                ),
+                MessageLayout(variance_topic, _assign_fields_by_axis("variance", aid, aid.fields)),
             ]
         )
     if aid.ekf2_innovations_fields:
         field_by_column = _assign_fields_by_axis("innovation", aid, aid.ekf2_innovations_fields)
         variance_fields = aid.ekf2_innovations_fields.replace("innov", "innov_var")
         field_by_column |= _assign_fields_by_axis("variance", aid, variance_fields)
-        layouts.append([Layout(px4.OLD_INNOVATION_TOPIC, field_by_column)] * 2)
-    for value_layout, variance_layout in layouts:
-        innovation = topics.primary_samples(value_layout)[f"innovation_{aid.axes[0]}"]
-        variance_samples = topics.primary_samples(variance_layout)
+        possible_layouts.append([MessageLayout(px4.OLD_INNOVATION_TOPIC, field_by_column)])
+    for layouts in possible_layouts:
+        # The innovations are in the first topic, their variances in the last
+        innovation = topics.primary_samples(layouts[0])[f"innovation_{aid.axes[0]}"]
+        variance_samples = topics.primary_samples(layouts[-1])
         variance = variance_samples[f"variance_{aid.axes[0]}"]
         is_new_variance = (variance > 0.0) & variance.ne(variance.shift())
-        samples = topics.primary_samples(value_layout, select_rows=_drop_repeats_and_zeros)
-        if variance_layout is not value_layout:
+        samples = topics.primary_samples(layouts[0], select_rows=_drop_repeats_and_zeros)
+        if len(layouts) == 2:
             # The nearest variance S is used, because PX4 logs it at other times
-            samples = join_nearest(
-                samples, variance_samples.dropna(), MAX_VARIANCE_TIME_DIFFERENCE_S
+            samples = join_nearest_samples(
+                samples, variance_samples.dropna(), MAX_TIME_FROM_INNOVATION_TO_VARIANCE_S
             )
         samples = samples.dropna()
         if enabled_flag is not None:
             samples = samples[sample_step_function(enabled_flag, samples.index) > 0.0]
         aid_log = _make_aid_log(
             topics,
-            tuple(dict.fromkeys((value_layout.topic, variance_layout.topic))),
+            tuple(layout.topic for layout in layouts),
             aid,
             samples,
             enabled_flag,

@@ -9,27 +9,32 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.core.arrays import Array, ArrayPair, IntArray
-from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_MODE_PARAMETER, GNSS_POS, fill_with_defaults
+from px4fuse.flight.ekf2_parameters import (
+    EV_POS,
+    GNSS_MODE_PARAMETER,
+    GNSS_POS,
+    fill_parameters_with_defaults,
+)
 from px4fuse.flight.model import (
     HEIGHT_ONLY_REASON,
     SENDER_CLOCK,
-    ClockMap,
+    ClockConversion,
     Columns,
     Ekf2,
     PositionTrack,
     SourceOrigin,
     Truth,
     Unavailable,
+    compute_sample_rate_hz,
     describe_repeated_timestamps,
     infer_position_kind,
-    sample_rate,
     time_index,
 )
 from px4fuse.readers.common import (
     classify_invalid_positions,
     estimate_quantisation_step,
     interpolate_inside_time_span,
-    join_nearest,
+    join_nearest_samples,
     read_attitude,
     read_orientation,
     select_valid_rows,
@@ -40,10 +45,10 @@ from px4fuse.readers.px4_innovations import has_fused_aid
 from px4fuse.readers.px4_topics import (
     FRAME_BY_FIELD_VALUE,
     FUSED_OBSERVATION_TRACK_NAME,
-    GPS_POSITION,
+    GPS_POSITION_TOPIC,
     LOCAL_POSITION_LAYOUT,
     RECONSTRUCTED_TRACK_NAME,
-    SOURCE_TRACKS,
+    SOURCE_TRACK_NAMES,
     TOPIC_LAYOUTS,
     TRACK_SOURCES,
     find_track_layouts,
@@ -61,7 +66,7 @@ MAX_ARRIVAL_TO_PUBLICATION_DELAY_US = 100
 MIN_ARRIVAL_TIME_FRACTION = 0.9
 # Maximum time (s) between a height and the horizontal position with which it is combined: an error
 # of 2.5 cm at 0.5 m/s
-MAX_HEIGHT_TIME_DIFFERENCE_S = 0.05
+MAX_TIME_FROM_POSITION_TO_HEIGHT_S = 0.05
 # At a lower rate (Hz), the logger dropped GNSS fixes; receivers send 5 to 20 Hz
 MAX_DOWNSAMPLED_HZ = 4.0
 POSITION_STATUS_COLUMNS = ["reset_counter", "quality", "age_s"]
@@ -88,7 +93,7 @@ def read_positions(topics: Topics, ekf2: Ekf2 | Unavailable) -> TracksAndMissing
     is_odometry = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags["yaw"] > 0).any())
     return split_tracks(
         [
-            *(_read_logged_track(topics, name) for name in SOURCE_TRACKS),
+            *(_read_logged_track(topics, name) for name in SOURCE_TRACK_NAMES),
             _read_fused_observation(topics, is_odometry),
             _reconstruct_track(topics, ekf2, is_odometry),
             _read_gnss_track(topics, ekf2),
@@ -132,19 +137,21 @@ def make_track(
     ----------
     samples : DataFrame
         Positions (m) and variances (m²). A variance of 0 means "not sent" (``EKF2.cpp``).
+    origin : SourceOrigin
+        Origin of the positions. The kind "uwb" means that the kind is inferred from the samples.
     needed_columns : list of str
-        Columns that must be finite.
+        Columns that must be finite: north and east, with or without down.
     is_odometry : bool
         True if the source also measures its orientation: it is then visual odometry, not UWB.
     track_fields
         Other fields of :class:`~px4fuse.flight.model.PositionTrack`.
     """
-    status_samples = samples[[name for name in POSITION_STATUS_COLUMNS if name in samples]]
+    status_samples = samples.filter(POSITION_STATUS_COLUMNS)
     samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
     quantisation_step_m = max(
-        estimate_quantisation_step(samples[name].to_numpy()) for name in needed_columns[:2]
+        estimate_quantisation_step(samples[name].to_numpy()) for name in Columns.POSITION[:2]
     )
-    is_number = samples[Columns.POSITION].notna().any()
+    is_measured = samples[Columns.POSITION].notna().any()
     if origin.is_gnss:  # a receiver at rest may repeat its position
         samples = select_valid_rows(samples, needed_columns)
     else:
@@ -153,13 +160,12 @@ def make_track(
         track_fields["invalid_reasons"] = invalid_reasons[invalid_reasons != ""]
     if len(samples) < MIN_TRACK_SAMPLES:
         fault = f"the track has only {len(samples)} finite samples, fewer than {MIN_TRACK_SAMPLES}"
-        if is_number.tolist() == [False, False, True]:
+        if is_measured["down_m"] and not is_measured[:"east_m"].any():
             fault = HEIGHT_ONLY_REASON
         return unavailable_source(name, fault, remedy)
     if origin.kind == "uwb":
-        origin = structs.replace(
-            origin, kind="vio" if is_odometry else infer_position_kind(samples)
-        )
+        kind = "vio" if is_odometry else infer_position_kind(samples)
+        origin = structs.replace(origin, kind=kind)
     variance = samples[Columns.POSITION_VARIANCE]
     return PositionTrack(
         name=name,
@@ -183,48 +189,24 @@ def _make_ulog_track(
     """Make a position track of a source that is defined in ``px4_topics.toml``."""
     source = TRACK_SOURCES[name]
     origin = structs.replace(source.origin, is_selectable_by_default=is_selectable_by_default)
+    default_fields: dict[str, Any] = {"frame": "NED", "clock": AUTOPILOT_CLOCK_TEXT}
     if origin.aid is not None:
-        parameters = topics.ekf2_parameters
-        lever_arm_m = tuple(parameters.get(parameter, 0.0) for parameter in origin.aid.lever_arm)
-        track_fields = {"lever_arm_m": lever_arm_m, **track_fields}
-    fields = {"frame": "NED", "clock": AUTOPILOT_CLOCK_TEXT, **track_fields}
-    fields |= {"description": source.description, "topics": topic_names, "log": topics.log.name}
-    return make_track(name, samples, origin, **fields)
-
-
-def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable:
-    layout = topics.find_layout(*find_track_layouts(name))
-    if layout is None:
-        return unavailable_source(name)
-    # EKF2's topics have one instance for each EKF2 instance
-    is_ekf2 = layout.topic.startswith("estimator_")
-    samples = topics.primary_samples(layout) if is_ekf2 else topics.read_instance(layout)
-    frame = TRACK_SOURCES[name].frame
-    for frame_field, frame_names in FRAME_BY_FIELD_VALUE.items():
-        if frame == "unknown" and frame_field in samples and len(samples):
-            frame = frame_names.get(int(samples[frame_field].iloc[-1]), "unknown")
-    if "published_us" in samples:
-        samples["age_s"] = 1e-6 * (samples["published_us"] - topics.time_origin_us) - samples.index
-    orientation = read_orientation(samples)
-    instance_count = len(topics.instances(layout.topic))
-    note = (
-        f"{instance_count} programs publish {layout.topic}. px4fuse and EKF2 use only instance 0."
-    )
-    return _make_ulog_track(
-        topics,
+        default_fields["lever_arm_m"] = tuple(
+            topics.ekf2_parameters.get(parameter, 0.0) for parameter in origin.aid.lever_arm
+        )
+    return make_track(
         name,
         samples,
-        (layout.topic,),
-        notes=(note,) if instance_count > 1 and not is_ekf2 else (),
-        is_odometry=orientation is not None,
-        frame=frame,
-        clock_map=_describe_clock_of_arrival_times(topics, layout.topic),
-        orientation=orientation,
+        origin,
+        description=source.description,
+        topics=topic_names,
+        log=topics.log.name,
+        **default_fields | track_fields,
     )
 
 
-def _describe_clock_of_arrival_times(topics: Topics, topic: str) -> ClockMap | None:
-    """Describe the clock of a topic without measurement times; otherwise return None.
+def _describe_clock_without_measurement_times(topics: Topics, topic: str) -> ClockConversion | None:
+    """Describe the timestamps of a topic if they are not measurement times; otherwise return None.
 
     PX4 logs arrival times until it has received 500 TIMESYNC replies (``Timesync.cpp``).
     """
@@ -244,39 +226,72 @@ def _describe_clock_of_arrival_times(topics: Topics, topic: str) -> ClockMap | N
         return describe_repeated_timestamps(
             SENDER_CLOCK, len(sample_timestamps_us), len(np.unique(sample_timestamps_us))
         )
-    return ClockMap(clock_name, "arrival time", len(age_us), 0.0, 0.0, 0.0, note)
+    # Offset, drift and jitter are zero, because no clock is converted
+    return ClockConversion(clock_name, "arrival time", len(age_us), 0.0, 0.0, 0.0, note)
+
+
+def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable:
+    layout = topics.find_layout(*find_track_layouts(name))
+    if layout is None:
+        return unavailable_source(name)
+    # EKF2's topics have one instance for each EKF2 instance
+    is_ekf2_topic = layout.topic.startswith("estimator_")
+    samples = topics.primary_samples(layout) if is_ekf2_topic else topics.read_instance(layout)
+    frame = TRACK_SOURCES[name].frame
+    for frame_field, frame_names in FRAME_BY_FIELD_VALUE.items():
+        if frame == "unknown" and frame_field in samples and len(samples):
+            frame = frame_names.get(int(samples[frame_field].iloc[-1]), "unknown")
+    if "published_us" in samples:
+        samples["age_s"] = 1e-6 * (samples["published_us"] - topics.time_origin_us) - samples.index
+    orientation = read_orientation(samples)
+    instance_count = len(topics.instances(layout.topic))
+    note = (
+        f"{instance_count} programs publish {layout.topic}. px4fuse and EKF2 use only instance 0."
+    )
+    return _make_ulog_track(
+        topics,
+        name,
+        samples,
+        (layout.topic,),
+        notes=(note,) if instance_count > 1 and not is_ekf2_topic else (),
+        is_odometry=orientation is not None,
+        frame=frame,
+        clock_map=_describe_clock_without_measurement_times(topics, layout.topic),
+        orientation=orientation,
+    )
 
 
 def _describe_timestamp_clock(published_us: IntArray, sample_timestamps_us: IntArray) -> str:
-    """Return clock and unit of timestamps, for example "UNIX time in seconds"."""
+    """Return the clock or the unit of timestamps that are not boot times in µs.
+
+    The unit follows from the rate of the timestamps relative to the publication times.
+    """
     if not sample_timestamps_us.any():
         return "0"
     rate_ratio = np.ptp(published_us) / np.maximum(np.ptp(sample_timestamps_us), 1)
     for unit, unit_us in MICROSECONDS_BY_UNIT.items():
         if abs(rate_ratio / unit_us - 1.0) < MAX_CLOCK_RATE_ERROR_FRACTION:
-            if (
-                MIN_VALID_UNIX_TIME_S
-                <= np.median(sample_timestamps_us) * unit_us * 1e-6
-                < MAX_VALID_UNIX_TIME_S
-            ):
+            median_s = np.median(sample_timestamps_us) * unit_us * 1e-6
+            if MIN_VALID_UNIX_TIME_S <= median_s < MAX_VALID_UNIX_TIME_S:
                 return f"UNIX time in {unit}"
+            # The unit µs is correct, so the clock differs from the boot clock
             return "another clock" if unit == "microseconds" else unit
     return "an unknown clock"
 
 
 def _read_fused_observation(topics: Topics, is_odometry: bool) -> PositionTrack | Unavailable:
-    horizontal, vertical = (
-        TOPIC_LAYOUTS["estimator_aid_src_ev_pos"],
-        TOPIC_LAYOUTS["estimator_aid_src_ev_hgt"],
-    )
-    if topics.find_layout(horizontal) is None:
+    horizontal = TOPIC_LAYOUTS["estimator_aid_src_ev_pos"]
+    vertical = TOPIC_LAYOUTS["estimator_aid_src_ev_hgt"]
+    layouts = (horizontal, vertical)
+    topic_names = tuple(layout.topic for layout in layouts if topics.find_layout(layout))
+    if horizontal.topic not in topic_names:
         return unavailable_source(FUSED_OBSERVATION_TRACK_NAME)
     return _make_track_from_ekf2_topics(
         topics,
         FUSED_OBSERVATION_TRACK_NAME,
         topics.primary_samples(horizontal),
         topics.primary_samples(vertical),
-        (horizontal.topic, vertical.topic)[: 1 + (topics.find_layout(vertical) is not None)],
+        topic_names,
         # EKF2 subtracts half a prediction interval from times (estimator_interface.cpp)
         shift_s=0.5 * configured_step_s(topics),
         is_odometry=is_odometry,
@@ -299,13 +314,14 @@ def _make_track_from_ekf2_topics(
     """
     notes: tuple[str, ...] = ()
     if len(height_samples):
-        samples = join_nearest(
-            samples, height_samples.assign(_found=True), MAX_HEIGHT_TIME_DIFFERENCE_S
+        samples = join_nearest_samples(
+            samples, height_samples.assign(_found=True), MAX_TIME_FROM_POSITION_TO_HEIGHT_S
         )
         if missing_count := samples.pop("_found").isna().sum():
             notes = (
                 f"{missing_count} of {len(samples)} external vision positions have no height "
-                f"within {1e3 * MAX_HEIGHT_TIME_DIFFERENCE_S:.0f} ms and are used without height",
+                f"within {1e3 * MAX_TIME_FROM_POSITION_TO_HEIGHT_S:.0f} ms and are used without "
+                "height",
             )
     shift_s += topics.log.parameters.get(EV_POS.delay, 0.0) * 1e-3
     return _make_ulog_track(
@@ -364,19 +380,23 @@ def project(latitude_deg: Array, longitude_deg: Array, origin: GeodeticPosition)
     """
     origin_latitude_rad, origin_longitude_rad = np.radians(origin[:2])
     latitude_rad = np.radians(latitude_deg)
-    longitude_step_rad = np.radians(longitude_deg) - origin_longitude_rad
+    longitude_difference_rad = np.radians(longitude_deg) - origin_longitude_rad
     sin_latitude, cos_latitude = np.sin(latitude_rad), np.cos(latitude_rad)
     sin_origin, cos_origin = np.sin(origin_latitude_rad), np.cos(origin_latitude_rad)
-    cos_longitude_step = np.cos(longitude_step_rad)
+    cos_longitude_difference = np.cos(longitude_difference_rad)
     arc_rad = np.arccos(
         np.clip(
-            sin_origin * sin_latitude + cos_origin * cos_latitude * cos_longitude_step, -1.0, 1.0
+            sin_origin * sin_latitude + cos_origin * cos_latitude * cos_longitude_difference,
+            -1.0,
+            1.0,
         )
     )
     # arc/sin(arc) · radius, equal to the radius at the origin
     scale_m = EARTH_RADIUS_M / np.sinc(arc_rad / np.pi)
-    north_m = scale_m * (cos_origin * sin_latitude - sin_origin * cos_latitude * cos_longitude_step)
-    return north_m, scale_m * cos_latitude * np.sin(longitude_step_rad)
+    north_m = scale_m * (
+        cos_origin * sin_latitude - sin_origin * cos_latitude * cos_longitude_difference
+    )
+    return north_m, scale_m * cos_latitude * np.sin(longitude_difference_rad)
 
 
 def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition | ArrayPair) -> ArrayPair:
@@ -427,17 +447,17 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     EKF2 subtracts EKF2_GPS_DELAY from the timestamps. Since 2026, it may use the measurement times
     of the GNSS driver instead (EKF2.cpp UpdateGpsSample, estimator_interface.cpp).
     """
-    layout = topics.find_layout(*find_track_layouts(GPS_POSITION))
+    layout = topics.find_layout(*find_track_layouts(GPS_POSITION_TOPIC))
     if layout is None:
-        return unavailable_source(GPS_POSITION)
+        return unavailable_source(GPS_POSITION_TOPIC)
     messages = topics.read_instance(layout)
     messages["published_s"] = (messages.pop("published_us") - topics.time_origin_us) * 1e-6
     has_fix = messages.get("fix_type", pd.Series(FIX_TYPE_3D, messages.index)) >= FIX_TYPE_3D
     fixes = messages[has_fix]
     if fixes.empty:
         return unavailable_source(
-            GPS_POSITION,
-            f"the log has {len(messages)} {GPS_POSITION}, none with a 3D fix",
+            GPS_POSITION_TOPIC,
+            f"the log has {len(messages)} {GPS_POSITION_TOPIC}, none with a 3D fix",
             NO_FIX_ACTION,
         )
     parameters = topics.ekf2_parameters
@@ -448,17 +468,17 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         delay_s = 0.0
         clock = "autopilot boot clock: measurement times from the GNSS driver"
     else:
-        delay_s = fill_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
+        delay_s = fill_parameters_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
         fixes = fixes.set_axis(time_index(fixes["published_s"].to_numpy() - delay_s))
         clock = f"autopilot boot clock: timestamp minus {GNSS_POS.delay} ({1e3 * delay_s:g} ms)"
     unlogged_fixes = read_unlogged_fixes(topics, fixes, ekf2)
     if len(unlogged_fixes):
         fixes = pd.concat([fixes, unlogged_fixes]).sort_index()
-        interpolated_count = fixes["altitude_m"].isna().sum()
+        interpolated_altitude_count = fixes["altitude_m"].isna().sum()
         # Copy fields that EKF2's topics do not contain from the previous fix
         fixes = fixes.assign(altitude_m=fixes["altitude_m"].interpolate("index")).ffill()
     samples = convert_gnss_fixes(fixes, _find_local_origin(topics))
-    rate_hz = sample_rate(samples)
+    rate_hz = compute_sample_rate_hz(samples)
     notes, is_downsampled = list[str](), rate_hz < MAX_DOWNSAMPLED_HZ
     if is_downsampled:
         notes.append(
@@ -468,7 +488,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     if len(unlogged_fixes):
         notes.append(
             f"{len(unlogged_fixes)} GNSS fixes missing in the GNSS topic are read from "
-            f"estimator_aid_src_gnss_pos ({interpolated_count} with interpolated height)"
+            f"estimator_aid_src_gnss_pos ({interpolated_altitude_count} with interpolated height)"
         )
     elif is_downsampled:
         reconstructed_fixes, note = reconstruct_fixes(samples, ekf2, delay_s)
@@ -482,7 +502,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     times_without_fix_s = messages["published_s"].to_numpy()[~has_fix] - delay_s
     return _make_ulog_track(
         topics,
-        GPS_POSITION,
+        GPS_POSITION_TOPIC,
         samples,
         (layout.topic,),
         clock=clock,

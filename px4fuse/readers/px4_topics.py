@@ -13,7 +13,7 @@ from msgspec import structs
 from px4fuse.core.record import read_toml
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.flight.model import SourceOrigin, find_source_origin
-from px4fuse.readers.common import Layout, expand_layouts
+from px4fuse.readers.common import MessageLayout, expand_layouts
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,10 @@ QUATERNION_VARIANCE_COUNT = 4
 # Values of the option --position-source
 FUSED_OBSERVATION_TRACK_NAME = "estimator_aid_src_ev_pos"
 RECONSTRUCTED_TRACK_NAME = "ekf2_state_plus_innovation"
-GPS_POSITION = "vehicle_gps_position"
+GPS_POSITION_TOPIC = "vehicle_gps_position"
 # Position sources that have their own topic, without GNSS
-SOURCE_TRACKS = [
-    name for name, track in TRACK_SOURCES.items() if track.layouts and name != GPS_POSITION
+SOURCE_TRACK_NAMES = [
+    name for name, track in TRACK_SOURCES.items() if track.layouts and name != GPS_POSITION_TOPIC
 ]
 # The flag "fused" of these aiding sources is always set in v1.15 and v1.16
 AIDS_ALWAYS_FUSED = ("gravity", "drag")
@@ -91,7 +91,7 @@ INNOVATION_TOPICS = "estimator_innovations", "estimator_innovation_variances"
 OLD_INNOVATION_TOPIC = "ekf2_innovations"
 
 
-def find_track_layouts(source_name: str) -> list[Layout]:
+def find_track_layouts(source_name: str) -> list[MessageLayout]:
     """Return the possible topics and fields of a position source, best first."""
     layouts = [TOPIC_LAYOUTS[name] for name in TRACK_SOURCES[source_name].layouts]
     return [replace(layout, topic=layout.topic or source_name) for layout in layouts]

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.reading import display_name, read_text
+from px4fuse.core.reading import UTF_16_BYTE_ORDER_MARKS, display_name, read_text
 from px4fuse.core.record import read_toml
 from px4fuse.core.text import join_first_names
 from px4fuse.errors import LogError, Px4FuseError
@@ -37,14 +37,12 @@ HEADERLESS_TABLE_FORMAT = "table without header"
 MIN_VALID_UNIX_TIME_S, MAX_VALID_UNIX_TIME_S = 946_684_800.0, 4_102_444_800.0
 # Number of characters that are searched for signs of a binary file
 _CHECKED_CHAR_COUNT = 100_000
-# Byte order marks of UTF-16, the encoding of texts from Windows shells
-_UTF_16_BYTE_ORDER_MARKS = (b"\xff\xfe", b"\xfe\xff")
 _CONTROL_CHARACTER_PATTERN = re.compile("[\x00-\x08\x0e-\x1b]")
 _NUMBER_PATTERN = re.compile(
     r"[+-]?(?:(?:[0-9]+\.?|[0-9]*\.[0-9]+)(?:e[+-]?[0-9]+)?|nan|inf)", re.IGNORECASE
 )
 _TEXT_FORMATS = read_toml(__file__, dict[str, list[dict[str, Any]]], "formats.toml")
-_ISO_DATE = re.compile(r"\d{4}-\d\d-\d\d")
+_ISO_DATE_PATTERN = re.compile(r"\d{4}-\d\d-\d\d")
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ class PositionTable:
     rows_text: str
     separator: str = ","
     # Line number of the header, 0 without header; None for formats without lines
-    header_line: int | None = None
+    header_line_number: int | None = None
     # Possible coordinate frames; empty if all are possible
     frames: tuple[str, ...] = ()
     # Frame rate, if the time column contains frame numbers
@@ -67,6 +65,13 @@ class PositionTable:
     # True if the table contains only one rigid body, tag or topic
     has_only_chosen_body: bool = False
     notes: tuple[str, ...] = ()
+
+    def describe_format(self) -> str:
+        """Describe the file format, or separator and header of a table with a header."""
+        if self.format:
+            return f"the file format is {self.format}"
+        separator_name = SEPARATORS[self.separator]
+        return f"the separator is {separator_name}, the header is line {self.header_line_number}"
 
     def format_labels(self, *columns: int | None) -> str:
         """Join the names of columns for a message to the user."""
@@ -80,8 +85,21 @@ class PositionTable:
     def format_first_line_number(self, rows: pd.Index) -> str:
         """Return the line number of the first row as text, such as " (first: line 7)"."""
         return (
-            "" if self.header_line is None else f" (first: line {self.header_line + 1 + rows[0]})"
+            ""
+            if self.header_line_number is None
+            else f" (first: line {self.header_line_number + 1 + rows[0]})"
         )
+
+    def check_row_width(self) -> None:
+        """Raise LogError if the first row has more columns than the header."""
+        first_row = self.rows_text[:MAX_HEADER_CHARS].lstrip("\n").partition("\n")[0]
+        row_width = len(_split_line(first_row.rstrip(f"{self.separator} "), self.separator))
+        if row_width > len(self.column_names):
+            raise LogError(
+                f"{self.file_name}: the header has {len(self.column_names)} columns, but the rows "
+                f"have {row_width}.",
+                "Write numbers with decimal points, and give each column a name.",
+            )
 
     def read_cells(self, columns: Iterable[int]) -> pd.DataFrame:
         """Return the text of the given columns, without empty rows."""
@@ -121,7 +139,7 @@ def refuse_foreign_format(path: Path, first_bytes: bytes, error_type: type[Px4Fu
 
 def decode_text(content: bytes) -> str | None:
     """Decode a text in UTF-8, UTF-16 or Latin-1, with line feeds as line ends; None if binary."""
-    if content.startswith(_UTF_16_BYTE_ORDER_MARKS):
+    if content.startswith(UTF_16_BYTE_ORDER_MARKS):
         text = content[: len(content) // 2 * 2].decode("utf-16", errors="replace")
     else:
         content = content.rstrip(b"\0\x1a")  # NUL at the end after a power loss, 0x1a from DOS
@@ -167,7 +185,7 @@ def choose_body(file_name: str, body_names: Iterable[str], wanted_body: str | No
     )
 
 
-def find_table(
+def find_position_table(
     path: Path, content: bytes, columns: tuple[str, ...] | None, body: str | None
 ) -> PositionTable:
     """Find the table of positions in a file.
@@ -190,6 +208,7 @@ def find_table(
     text = decode_text(content)
     if text is None:
         raise LogError(f"{file_name} is a binary file, not a text table", "Give a CSV file.")
+    # The last line may be incomplete if it has no line feed
     whole_lines, _, last_line = text.rpartition("\n")
     is_last_line_complete = _is_complete_line(last_line, whole_lines.rpartition("\n")[2])
     text = f"{text if is_last_line_complete else whole_lines}\n"
@@ -198,6 +217,7 @@ def find_table(
     lines = header_text.split("\n")[:MAX_HEADER_LINES]
     wanted_names = {column.strip().casefold() for column in columns or () if not column.isdecimal()}
     table = None
+    # Columns are chosen by the user only in tables with columns: with a header, or by number
     if columns is None:
         table = (
             _find_json_table(file_name, text)
@@ -214,14 +234,7 @@ def find_table(
             f"{column_list}. The first line is {quote(lines[0])}.",
             f"Add the header time,x,y,z. Alternatively, name the columns with {COLUMNS_OPTION}.",
         )
-    first_row = table.rows_text[:MAX_HEADER_CHARS].lstrip("\n").partition("\n")[0]
-    row_width = len(_split_line(first_row.rstrip(f"{table.separator} "), table.separator))
-    if row_width > len(table.column_names):
-        raise LogError(
-            f"{file_name}: the header has {len(table.column_names)} columns, but the rows have "
-            f"{row_width}.",
-            "Write numbers with decimal points, and give each column a name.",
-        )
+    table.check_row_width()
     if last_line.strip() and not is_last_line_complete:
         note = "the last line of the position file was dropped, because it is incomplete"
         return replace(table, notes=(*table.notes, note))
@@ -270,7 +283,13 @@ def _has_time_and_position(column_names: list[str]) -> bool:
 def _find_body_table(
     file_name: str, text: str, lines: Sequence[str], wanted_body: str | None
 ) -> PositionTable | None:
-    """Find the columns of one rigid body in a CSV export of Motive or Vicon Nexus."""
+    """Find the columns of one rigid body in a CSV export of Motive or Vicon Nexus.
+
+    The header of Motive begins with pairs of name and value (Format Version, Length Units). Then
+    follow lines with a title in the second column: Type, Name, ID, Rotation or Position, and the
+    axes. The header of Vicon Nexus has the frame rate in line 2, and the bodies in line 3, each
+    above its first column. Then follow the axes (RX, RY, RZ, TX, TY, TZ) and the units.
+    """
     axes_row = next((i for i, line in enumerate(lines[:12]) if line.startswith("Frame,")), 0)
     if axes_row < 3:
         return None
@@ -285,6 +304,7 @@ def _find_body_table(
         unit = dict(zip(rows[0][::2], rows[0][1::2], strict=False)).get("Length Units", "")
         values_by_title = {header.loc[1, row]: header[row] for row in range(2, axes_row)}
         body_names = values_by_title.get("Name", axes)
+        # All bodies are possible if the line Type is missing, or contains no rigid body
         is_rigid_body = values_by_title.get("Type", axes) == "Rigid Body"
         # Rotations are not read, because the axes of a rigid body are not FRD
         is_position = header[axes_row - 1] == "Position"
@@ -295,6 +315,7 @@ def _find_body_table(
         axes = axes.str.removeprefix("T")
         is_position = axes.isin([*"XYZ"])
         column_names = axes + "_" + header[axes_row + 1]
+        # The rows begin after the units, and end at an empty line
         rows_text = re.split(r"\n[, ]*\n", rows_text.partition("\n")[2], maxsplit=1)[0] + "\n"
     chosen_body_name = choose_body(file_name, body_names[is_position], wanted_body)
     is_chosen = is_position & (body_names == chosen_body_name)
@@ -304,7 +325,7 @@ def _find_body_table(
         "OptiTrack Motive CSV export" if is_motive else "Vicon Nexus CSV export",
         [*first_columns, *column_names.where(is_chosen, "")[2:]],
         rows_text,
-        header_line=axes_row + 1,
+        header_line_number=axes_row + 1,
         # Motive exports y up by default, or z up; the file does not state which
         frames=("eus", "enu") if is_motive else (),
         rate_hz=None if is_motive else float(rows[1][0]),
@@ -317,6 +338,7 @@ def _find_stream_table(file_name: str, text: str, lines: Sequence[str]) -> Posit
     """Find the positions in a text format of a UWB system (``formats.toml``)."""
     for stream_format in _TEXT_FORMATS["streams"]:
         pattern = re.compile(stream_format["row"], re.MULTILINE)
+        # Search the first lines only: a long file of another format takes much time
         if not any(map(pattern.match, lines)):
             continue
         rows = pattern.findall(text)
@@ -363,12 +385,13 @@ def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> Posit
         decimal_fields = [field.replace(",", ".") for field in fields]
         if not 4 <= len(fields) <= MAX_COLUMNS or not all(map(is_number, decimal_fields[1:])):
             continue
-        if separator == " " and len(fields) == 12:
+        if separator == " " and len(fields) == 12:  # matrix of 3 rows and 4 columns
             return _read_kitti_table(path, text)
-        if is_number(decimal_fields[0]) or _ISO_DATE.match(fields[0]):
+        if is_number(decimal_fields[0]) or _ISO_DATE_PATTERN.match(fields[0]):
             name, quaternion_order = HEADERLESS_TABLE_FORMAT, ""
             if separator in " \t" and len(fields) == 8:
                 name, quaternion_order = "TUM trajectory", "xyzw"
+            # Times in ns have 19 digits. Velocity and biases follow in the full format
             elif separator == "," and len(fields) in (8, 17) and len(fields[0]) == 19:
                 name, quaternion_order = "EuRoC ground truth", "wxyz"
             column_names = ["time", "x", "y", "z", *(f"q{axis}" for axis in quaternion_order)]
@@ -390,13 +413,13 @@ def _read_kitti_table(path: Path, text: str) -> PositionTable:
     # imported here, because most recordings need no rotations
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
 
-    name, times_name = display_name(path), f"{path.stem}_times.txt"
-    candidate_paths = (path.with_name(times_name), path.with_name("times.txt"))
+    name, times_file_name = display_name(path), f"{path.stem}_times.txt"
+    candidate_paths = (path.with_name(times_file_name), path.with_name("times.txt"))
     times_path = next(filter(Path.is_file, candidate_paths), None)
     if times_path is None:
         raise LogError(
             f"{name}: the file contains KITTI poses, which have no times",
-            f"Save the times (s), one per line, as {times_name} in the same folder.",
+            f"Save the times (s), one per line, as {times_file_name} in the same folder.",
         )
     time_texts = read_text(times_path, LogError, MAX_FILE_BYTES).split()
     try:

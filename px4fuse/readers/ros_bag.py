@@ -10,8 +10,8 @@ import numpy as np
 from px4fuse.core.reading import (
     LOG_SIZE_REMEDY,
     display_name,
-    file_size,
     format_size_limit,
+    get_file_size,
     list_files_recursively,
     max_log_bytes,
 )
@@ -38,19 +38,23 @@ _POSITION_MESSAGE_TYPES = (
 
 def _read_pose_values(message: Any) -> list[float]:
     """Return x, y, z and, if available, the quaternion (x, y, z, w) and the position σ."""
-    if hasattr(message, "q"):
+    if hasattr(message, "q"):  # px4_msgs/VehicleOdometry, with the quaternion w, x, y, z
         return [*message.position.tolist(), *np.roll(message.q, -1).tolist()]
-    pose = getattr(message, "pose", None) or getattr(message, "transform", message)
-    variances = getattr(pose, "covariance", np.zeros(0))[::7][:3]
-    pose = getattr(pose, "pose", pose)
-    vectors = [
-        getattr(pose, name, None)
-        for name in ("point", "position", "translation", "orientation", "rotation")
-    ]
-    values = [
+    sigma: list[float] = []
+    if hasattr(message, "point"):  # PointStamped
+        vectors = [message.point]
+    elif hasattr(message, "transform"):  # TransformStamped
+        vectors = [message.transform.translation, message.transform.rotation]
+    else:
+        pose = message.pose
+        if hasattr(pose, "covariance"):  # Odometry and PoseWithCovarianceStamped
+            variances = pose.covariance.reshape(6, 6).diagonal()[:3]
+            sigma = np.sqrt(np.where(variances > 0.0, variances, np.nan)).tolist()
+            pose = pose.pose
+        vectors = [pose.position, pose.orientation]
+    return [
         getattr(vector, axis) for vector in vectors for axis in "xyzw" if hasattr(vector, axis)
-    ]
-    return [*values, *np.sqrt(np.where(variances > 0.0, variances, np.nan)).tolist()]
+    ] + sigma
 
 
 def is_bag(path: Path) -> bool:
@@ -77,7 +81,7 @@ def read_bag(path: Path, topic: str | None) -> tuple[PositionTable, str, int]:
             "Run pip install 'px4fuse[ros]'.",
         ) from None
     files = list_files_recursively(path) if path.is_dir() else [path]
-    size_bytes = sum(file_size(file, LogError) for file in files)
+    size_bytes = sum(get_file_size(file, LogError) for file in files)
     if size_bytes > max_log_bytes.get():
         raise LogError(format_size_limit(name, size_bytes, max_log_bytes.get()), LOG_SIZE_REMEDY)
     sha256 = hashlib.sha256()
@@ -117,18 +121,18 @@ def _read_topic(name: str, reader: Any, topic: str | None) -> PositionTable:
     )
     if message_type == _PATH_MESSAGE_TYPE:
         messages = deque(messages, maxlen=1)  # the last path repeats the poses of all others
-    csv_rows, pose_frames = [], set()
+    rows, pose_frames = [], set()
     for connection, _, raw_message in messages:
         message = reader.deserialize(raw_message, connection.msgtype)
-        for stamped_message in message.poses if message_type == _PATH_MESSAGE_TYPE else [message]:
-            pose_frames.add(getattr(stamped_message, "pose_frame", None))
-            values = _read_time_ns(stamped_message), *_read_pose_values(stamped_message)
-            csv_rows.append(f"{','.join(map(str, values))}\n")
+        for pose in message.poses if message_type == _PATH_MESSAGE_TYPE else [message]:
+            pose_frames.add(getattr(pose, "pose_frame", None))
+            rows.append([_read_time_ns(pose), *_read_pose_values(pose)])
+    column_count = len(rows[0]) - 1 if rows else 3
     return PositionTable(
         name,
         "ROS bag",
-        ["time_ns", *_POSE_COLUMNS[: csv_rows[0].count(",") if csv_rows else 3]],
-        "".join(csv_rows),
+        ["time_ns", *_POSE_COLUMNS[:column_count]],
+        "".join(f"{','.join(map(str, row))}\n" for row in rows),
         has_only_chosen_body=True,
         frames=("ned",) if pose_frames == {_FRAME_NED} else (),
         notes=(f"the topic is {topic} ({message_type})",),

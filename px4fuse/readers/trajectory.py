@@ -39,7 +39,7 @@ MAX_TILT_RAD = math.radians(20.0)
 # Minimum fraction of intervals near the median interval, for a regular frame rate
 MIN_REGULAR_INTERVAL_FRACTION = 0.9
 # Maximum relative difference of a regular interval from the median interval
-MAX_MEDIAN_INTERVAL_DEVIATION = 0.5
+MAX_RELATIVE_DEVIATION_FROM_MEDIAN_INTERVAL = 0.5
 # Minimum duration of a gap between two poses ÷ median interval between poses
 MIN_GAP_IN_MEDIAN_INTERVALS = 2.5
 # Minimum duration (s) of a gap between two poses
@@ -96,7 +96,9 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
     first_bytes = b"" if is_bag(path) else read_head(path, _COMMENT_SEARCH_BYTES, TrajectoryError)
     comment_text = "\n".join(re.findall(r"(?m)^\s*#.*", first_bytes.decode(errors="replace")))
     kind, kind_note = _detect_trajectory_kind(path, comment_text, position_m, rotation)
+    # A frame that the file format or the column names state is preferred to the detected frame
     frame, frame_note = _detect_frame(kind, position_m)
+    frame = _FRAME_BY_RECORDING_FRAMES.get(recording.frames, frame)
     time_s = samples.index.to_numpy()
     notes = (*recording.format_detection_notes, *recording.notes)
     return Trajectory(
@@ -105,7 +107,7 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
         time_s=time_s,
         position_m=position_m,
         rotation=rotation,
-        frame=_FRAME_BY_RECORDING_FRAMES.get(recording.frames, frame),
+        frame=frame,
         unix_offset_s=0.0 if recording.clock_kind == "UNIX" else None,
         sha256=recording.sha256,
         size_bytes=recording.size_bytes,
@@ -195,7 +197,7 @@ def _describe_gaps(time_s: Array) -> str:
     """Return a note on gaps or irregular intervals between poses; "" if there are none."""
     intervals_s = np.diff(time_s)
     median_interval_s = np.median(intervals_s)
-    max_deviation_s = MAX_MEDIAN_INTERVAL_DEVIATION * median_interval_s
+    max_deviation_s = MAX_RELATIVE_DEVIATION_FROM_MEDIAN_INTERVAL * median_interval_s
     is_regular = np.abs(intervals_s - median_interval_s) <= max_deviation_s
     if np.mean(is_regular) < MIN_REGULAR_INTERVAL_FRACTION:
         return (

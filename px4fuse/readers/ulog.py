@@ -20,7 +20,7 @@ from px4fuse.readers.px4_ekf2 import read_ekf2
 from px4fuse.readers.px4_positions import FIX_TYPE_3D, barometer, read_positions, read_truth
 from px4fuse.readers.px4_topics import (
     DEFAULT_PROFILE_REMEDY,
-    GPS_POSITION,
+    GPS_POSITION_TOPIC,
     IMU_LAYOUT,
     TOPIC_LAYOUTS,
     UNUSED_TOPICS,
@@ -74,7 +74,8 @@ def read_ulog(name: str, content: bytes) -> Flight:
     barometer_delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
     is_in_flight = common.ends_in_flight(airborne_spans_s, topics.log.duration_s)
     dropped_counts = dict(sorted(topics.dropped.items()))
-    tilt_failure_flags = topics.read(TOPIC_LAYOUTS["failure_detector_status"])
+    # Flags of the failure detector for roll and pitch
+    has_excessive_tilt = topics.read(TOPIC_LAYOUTS["failure_detector_status"]).any(axis=1)
     return Flight(
         log=structs.replace(
             topics.log,
@@ -90,9 +91,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
         ekf2=ekf2,
         truth=truth,
         airborne=airborne_spans_s,
-        excessive_tilt_spans_s=common.find_flight_spans(
-            tilt_failure_flags.max(axis=1) == 0.0, topics.log.duration_s
-        ),
+        excessive_tilt_spans_s=common.find_spans(has_excessive_tilt, topics.log.duration_s),
         barometer=barometer(altitude_m, barometer_delay_s),
         missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *unavailable_positions),
         streams=topics.data_source_by_kind,
@@ -125,7 +124,7 @@ def _describe_damage(
 
 def _estimate_start_unix_s(topics: Topics) -> float | None:
     """Return the UNIX time (s) at flight time zero, from GNSS; None if not logged."""
-    fixes = topics.read(*find_track_layouts(GPS_POSITION))
+    fixes = topics.read(*find_track_layouts(GPS_POSITION_TOPIC))
     fixes = fixes.reindex(columns=["utc_us", "fix_type"])
     unix_time_s = fixes["utc_us"] * 1e-6
     is_valid = unix_time_s.between(*VALID_UNIX_TIME_RANGE_S) & ~(fixes["fix_type"] < FIX_TYPE_3D)
@@ -133,7 +132,7 @@ def _estimate_start_unix_s(topics: Topics) -> float | None:
 
 
 def _require_samples(
-    topics: Topics, samples: pd.DataFrame, name: str, layout: common.Layout, remedy: str
+    topics: Topics, samples: pd.DataFrame, name: str, layout: common.MessageLayout, remedy: str
 ) -> TableOrUnavailable:
     """Return the samples of a topic, or the reason if there are fewer than two."""
     topic = layout.topic
@@ -146,20 +145,22 @@ def _require_samples(
 
 
 def _read_imu(topics: Topics) -> pd.DataFrame:
+    """Read the valid IMU samples, with the measurement times of the accelerometer."""
     imu = topics.read(IMU_LAYOUT)
     # single arrays, because a copy of the whole table needs much memory
     columns = {name: values.to_numpy() for name, values in imu.items()}
-    time_s, rows = imu.index.to_numpy(), np.arange(len(imu))
-    if (offset_us := columns.pop("accelerometer_offset_us", None)) is not None:
-        rows = np.flatnonzero(offset_us != INVALID_ACCELEROMETER_OFFSET_US)
-        time_us = np.rint(time_s[rows] * 1e6 + offset_us[rows])
-        kept_rows = find_longest_increasing_subsequence(
-            time_us.astype(np.int64) + topics.time_origin_us
-        )
-        time_s, rows = time_us[kept_rows] * 1e-6, rows[kept_rows]
+    offset_us = columns.pop("accelerometer_offset_us", np.zeros(len(imu)))
+    is_valid = offset_us != INVALID_ACCELEROMETER_OFFSET_US
     for name in Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE:
-        is_valid = np.abs(columns[name][rows]) < common.MAX_IMU_READING
-        time_s, rows = time_s[is_valid], rows[is_valid]
+        is_valid &= np.abs(columns[name]) < common.MAX_IMU_READING
+    rows = np.flatnonzero(is_valid)
+    # Boot times, because find_longest_increasing_subsequence needs positive times
+    boot_time_us = np.rint(
+        imu.index.to_numpy()[rows] * 1e6 + offset_us[rows] + topics.time_origin_us
+    )
+    kept_rows = find_longest_increasing_subsequence(boot_time_us.astype(np.int64))
+    time_s = (boot_time_us[kept_rows] - topics.time_origin_us) * 1e-6
+    rows = rows[kept_rows]
     samples = np.empty((len(columns), len(rows)), np.float32)  # as in the log, to save memory
     for row, values in zip(samples, columns.values(), strict=True):
         row[:] = values[rows]
@@ -175,4 +176,4 @@ def _read_airborne_spans(topics: Topics) -> Spans | Unavailable:
             f"{DEFAULT_PROFILE_REMEDY} Or give the start and end of the flight (--start, --end).",
         )
     topics.record_stream("airborne", "vehicle_land_detected")
-    return common.find_flight_spans(land_detected["landed"], topics.log.duration_s)
+    return common.find_spans(land_detected["landed"] == 0.0, topics.log.duration_s)

@@ -26,7 +26,7 @@ from px4fuse.core.arrays import IntArray
 from px4fuse.core.text import join_first_names
 from px4fuse.errors import LogError
 from px4fuse.flight.ekf2_parameters import (
-    PARAMETERS,
+    MODEL_PARAMETERS,
     PARAMETERS_IN_RESULTS,
     replace_invalid_parameters,
 )
@@ -39,7 +39,7 @@ from px4fuse.flight.model import (
     sample_step_function,
     time_index,
 )
-from px4fuse.readers.common import MAX_FIELD_VALUE, Layout
+from px4fuse.readers.common import MAX_FIELD_VALUE, MessageLayout
 from px4fuse.readers.px4_topics import IMU_LAYOUT, TOPIC_LAYOUTS, list_topics
 
 _MICROSECOND_S = 1e-6
@@ -61,12 +61,12 @@ MAX_FIELDS = 200_000
 HEADER_BYTES = 3
 # Header of a sample: length of the message, its type, and number of the topic instance
 SAMPLE_HEADER = struct.Struct("<HBH")
-TIME = struct.Struct("<Q")
+TIMESTAMP_FORMAT = struct.Struct("<Q")
 
 # Samples of one topic instance: an array for each PX4 field
 TopicArrays = dict[str, NDArray[Any]]
 # Tables by topic name and instance number
-Tables = dict[tuple[str, int], TopicArrays]
+TopicTables = dict[tuple[str, int], TopicArrays]
 # Time (s) and number of each new primary EKF2 instance
 InstanceSwitches = tuple[tuple[float, int], ...]
 # Value for logs without a change of the primary instance: EKF2 instance 0 is always primary
@@ -116,10 +116,13 @@ def _read_samples(parser: ULog, content: bytes, start: int) -> int:
         if number in subscriptions:
             subscription, sample_start = subscriptions[number], start + SAMPLE_HEADER.size
             time_start = sample_start + subscription.timestamp_offset
-            if subscription.dtype.itemsize != end - sample_start or end < time_start + TIME.size:
+            if (
+                subscription.dtype.itemsize != end - sample_start
+                or end < time_start + TIMESTAMP_FORMAT.size
+            ):
                 break
             subscription.buffer += content[sample_start:end]
-            (time_us,) = TIME.unpack_from(content, time_start)
+            (time_us,) = TIMESTAMP_FORMAT.unpack_from(content, time_start)
             if time_us > last_time_us:  # noqa: PLR1730 (max is slower)
                 last_time_us = time_us
         elif number not in ignored_message_ids:
@@ -196,21 +199,21 @@ class Topics:
     """Decoded topics of a ULog, and a description of the log."""
 
     log: LogInfo
-    tables: Tables
+    tables: TopicTables
     # Boot time (µs) at flight time zero
     time_origin_us: int
-    # Number of samples with an invalid timestamp, by topic
-    dropped: dict[str, int]
     # All EKF2 parameters at take-off
     ekf2_parameters: Mapping[str, float]
     # True if the file ends within a message
     is_truncated: bool
     # True if pyulog skipped invalid bytes or messages
     is_damaged: bool
+    # Changes of EKF2 parameters after take-off
+    parameter_changes: tuple[ParameterChange, ...]
     # Topics and clock of each kind of data, such as "imu"
     data_source_by_kind: dict[str, DataSource] = field(default_factory=dict)
-    # Changes of EKF2 parameters after take-off
-    parameter_changes: tuple[ParameterChange, ...] = ()
+    # Number of samples with an invalid timestamp, by topic
+    dropped: dict[str, int] = field(default_factory=dict)
 
     def instances(self, topic: str) -> list[int]:
         """Return the instance numbers of a topic, in ascending order."""
@@ -230,7 +233,7 @@ class Topics:
         numbers = primary_instance_changes.astype(int).tolist()
         return tuple(zip(switch_times_s, numbers, strict=False)) or NO_INSTANCE_SWITCHES
 
-    def find_layout(self, *layouts: Layout) -> Layout | None:
+    def find_layout(self, *layouts: MessageLayout) -> MessageLayout | None:
         """Return the first topic definition whose required fields are in the log, or None."""
         for layout in layouts:
             if any(
@@ -239,7 +242,7 @@ class Topics:
                 return layout
         return None
 
-    def read_instance(self, layout: Layout, instance: int = 0) -> pd.DataFrame:
+    def read_instance(self, layout: MessageLayout, instance: int = 0) -> pd.DataFrame:
         """Read the fields of a topic instance as float64, indexed by measurement time (s).
 
         Parameters
@@ -258,7 +261,7 @@ class Topics:
             for column, field_name in {**layout.columns, **layout.optional_columns}.items()
             if field_name in table
         }
-        time_us = measurement_time_us(table)
+        time_us = get_measurement_times_us(table)
         kept_rows = find_longest_increasing_subsequence(time_us)
         if len(kept_rows) < len(time_us):
             self.dropped[layout.topic] = len(time_us) - len(kept_rows)
@@ -275,7 +278,7 @@ class Topics:
         end_s = self.log.duration_s + MAX_TIME_OUTSIDE_IMU_DATA_S
         return rows_between(samples, -MAX_TIME_OUTSIDE_IMU_DATA_S, end_s)
 
-    def read(self, *layouts: Layout) -> pd.DataFrame:
+    def read(self, *layouts: MessageLayout) -> pd.DataFrame:
         """Read a topic with the first of several definitions whose required fields are logged.
 
         Return an empty table if no definition fits.
@@ -285,7 +288,7 @@ class Topics:
 
     def primary_samples(
         self,
-        layout: Layout,
+        layout: MessageLayout,
         select_rows: Callable[[pd.DataFrame], pd.DataFrame] = lambda samples: samples,
     ) -> pd.DataFrame:
         """Read an EKF2 topic from the EKF2 instance that was primary at each time.
@@ -312,7 +315,7 @@ class Topics:
         """
         # The timestamp of sensor_combined is the gyro's measurement time
         has_measurement_time = data_kind == "imu" or any(
-            np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))
+            np.any(get_measurement_times_us(table) != table["timestamp"].astype(np.int64))
             for table in self.tables_of(topics[0])
         )
         timestamp_kind = "measurement" if has_measurement_time else "publication"
@@ -320,13 +323,13 @@ class Topics:
         self.data_source_by_kind[data_kind] = DataSource(topics, clock, self.log.name)
 
 
-def _empty_frame(layout: Layout) -> pd.DataFrame:
+def _empty_frame(layout: MessageLayout) -> pd.DataFrame:
     return pd.DataFrame(
         columns=list(layout.columns), index=time_index(np.zeros(0)), dtype=np.float64
     )
 
 
-def measurement_time_us(table: TopicArrays) -> NDArray[np.int64]:
+def get_measurement_times_us(table: TopicArrays) -> NDArray[np.int64]:
     """Return the measurement time since boot (µs) of each sample: ``timestamp_sample``.
 
     If it is missing or invalid, return the publication time (``timestamp``). It is invalid in GPS
@@ -364,12 +367,12 @@ def find_longest_increasing_subsequence(time_us: NDArray[np.int64]) -> IntArray:
         previous_index[index] = end_indices[length - 1] if length else -1
         smallest_end_times[length : length + 1] = [time]
         end_indices[length : length + 1] = [index]
-    reversed_run_indices = []
+    reversed_subsequence_indices = []
     index = end_indices[-1]
     while index >= 0:
-        reversed_run_indices.append(index)
+        reversed_subsequence_indices.append(index)
         index = int(previous_index[index])
-    return positive_time_indices[np.array(reversed_run_indices[::-1], dtype=np.intp)]
+    return positive_time_indices[np.array(reversed_subsequence_indices[::-1], dtype=np.intp)]
 
 
 def describe_dropped_samples(dropped_counts: Mapping[str, int]) -> tuple[str, ...]:
@@ -393,8 +396,8 @@ def read_topics(name: str, content: bytes) -> Topics:
         with contextlib.redirect_stdout(io.StringIO()):  # suppress the warnings that pyulog prints
             ulog = _TolerantULogParser(content_reader, message_name_filter_list=list_topics())
             tables = _read_tables(ulog)
-            # Without known topics, read all topics for the duration of the log
-            tables_for_time_span = tables or _read_tables(
+            # Without known topics, read all topics, because the duration of the log is needed
+            known_or_all_topic_tables = tables or _read_tables(
                 _TolerantULogParser(_ULogContent(content))
             )
     except Exception as error:  # pyulog raises many types for damaged bytes
@@ -402,20 +405,23 @@ def read_topics(name: str, content: bytes) -> Topics:
             f"{name}: the ULog cannot be read ({str(error) or type(error).__name__}).",
             "Copy the .ulg from the vehicle again.",
         ) from error
-    if not tables_for_time_span:
+    if not known_or_all_topic_tables:
         raise LogError(
             f"{name}: the ULog contains no samples",
             "Copy the file again, or set SDLOG_PROFILE to 129 (default and vision topics).",
         )
     info, notes = ulog.msg_info_dict, []
     if not tables:
-        names = join_first_names(sorted({topic for topic, _ in tables_for_time_span}), 5)
+        names = join_first_names(sorted({topic for topic, _ in known_or_all_topic_tables}), 5)
         notes.append(f"the log contains only topics that px4fuse does not use ({names})")
     if NOTE_KEY in info:
         notes.append(_read_printable_text(info, NOTE_KEY, ""))
-    time_origin_us, data_end_us = _find_data_span_us(tables_for_time_span, name)
+    time_origin_us, data_end_us = _find_data_span_us(known_or_all_topic_tables, name)
     logged_values, parameter_changes = _read_parameters(ulog, tables, time_origin_us)
-    parameter_values, parameter_faults = replace_invalid_parameters(logged_values)
+    parameter_values, invalid_parameter_notes = replace_invalid_parameters(logged_values)
+    # pyulog has read the file up to its last header. The rest is an incomplete message
+    last_header_offset = content_reader.header_start_offset
+    is_truncated = last_header_offset < len(content) < content_reader.read_end_offset
     log = LogInfo(
         name=name,
         sha256=hashlib.sha256(content).hexdigest(),
@@ -438,10 +444,10 @@ def read_topics(name: str, content: bytes) -> Topics:
         parameter_defaults={
             name: value
             for name, value in sorted(ulog.get_default_parameters(0).items())
-            if name in PARAMETERS
+            if name in MODEL_PARAMETERS
         },
-        notes=(*notes, *parameter_faults),
-        bytes_read=content_reader.header_start_offset - content_reader.skipped_bytes,
+        notes=(*notes, *invalid_parameter_notes),
+        bytes_read=last_header_offset - content_reader.skipped_bytes,
         autopilot=_read_printable_text(info, "sys_name", "PX4"),
         vehicle=_read_printable_text(info, "sys_uuid", ""),
         is_assessed=True
@@ -452,46 +458,41 @@ def read_topics(name: str, content: bytes) -> Topics:
         log,
         tables,
         time_origin_us,
-        {},
         {name: value for name, value in parameter_values.items() if name.startswith("EKF2_")},
-        content_reader.header_start_offset < len(content) < content_reader.read_end_offset,
+        is_truncated,
         ulog.file_corruption,
-        parameter_changes=parameter_changes,
+        parameter_changes,
     )
 
 
 def _read_parameters(
-    ulog: ULog, tables: Tables, time_origin_us: int
+    ulog: ULog, tables: TopicTables, time_origin_us: int
 ) -> tuple[dict[str, float], tuple[ParameterChange, ...]]:
     """Return the parameters at take-off, and later changes of EKF2 parameters."""
-    parameter_values = {
-        name: float(value)
-        for name, value in ulog.initial_parameters.items()
-        if isinstance(value, int | float)
-    }
     land_detector, take_off_time_us = tables.get(("vehicle_land_detected", 0), {}), 0
     landed = land_detector.get("landed")
     if landed is not None and not landed.all():
-        take_off_time_us = int(land_detector["timestamp"][np.argmin(landed)])
-    parameter_changes: list[ParameterChange] = []
-    last_parameter_values = parameter_values.copy()
-    for time_us, name, value in sorted(ulog.changed_parameters, key=lambda change: change[0]):
+        # Time of the first sample with landed = 0
+        take_off_time_us = int(land_detector["timestamp"][landed.argmin()])
+    values_at_take_off, last_values, changes = dict[str, float](), dict[str, float](), []
+    time_us_and_parameters = [(0, *parameter) for parameter in ulog.initial_parameters.items()]
+    time_us_and_parameters += sorted(ulog.changed_parameters, key=lambda change: change[0])
+    for time_us, name, value in time_us_and_parameters:
         if not isinstance(value, int | float):
             continue
-        if time_us <= take_off_time_us or name not in parameter_values:
-            parameter_values[name] = float(value)
-        elif name.startswith("EKF2_") and last_parameter_values[name] != value:
+        # The first logged value of a parameter is also its value at take-off
+        if time_us <= take_off_time_us or name not in last_values:
+            values_at_take_off[name] = float(value)
+        elif name.startswith("EKF2_") and value != last_values[name]:
             time_s = (time_us - time_origin_us) * _MICROSECOND_S
-            parameter_changes.append(
-                ParameterChange(time_s, name, last_parameter_values[name], float(value))
-            )
-        last_parameter_values[name] = float(value)
-    return parameter_values, tuple(parameter_changes)
+            changes.append(ParameterChange(time_s, name, last_values[name], float(value)))
+        last_values[name] = float(value)
+    return values_at_take_off, tuple(changes)
 
 
-def _read_tables(ulog: ULog) -> Tables:
+def _read_tables(ulog: ULog) -> TopicTables:
     """Return the samples of each topic instance. Two subscriptions to one instance are merged."""
-    tables: Tables = {}
+    tables: TopicTables = {}
     for subscription in ulog.data_list:
         table: TopicArrays = subscription.data
         if "timestamp" not in table:
@@ -509,7 +510,7 @@ def _read_tables(ulog: ULog) -> Tables:
     return tables
 
 
-def _find_data_span_us(tables: Tables, name: str) -> tuple[int, int]:
+def _find_data_span_us(tables: TopicTables, name: str) -> tuple[int, int]:
     """Return first and last time (µs) of the IMU data, or of the largest topic without IMU."""
     for key in sorted(
         tables, key=lambda key: (key[0] != IMU_LAYOUT.topic, -len(tables[key]["timestamp"]))
@@ -521,8 +522,8 @@ def _find_data_span_us(tables: Tables, name: str) -> tuple[int, int]:
             gap_rows = (
                 np.flatnonzero(np.diff(increasing_times_us) > MAX_DATA_GAP_S / _MICROSECOND_S) + 1
             )
-            times_without_gap_us = max(np.split(increasing_times_us, gap_rows), key=len)
-            return int(times_without_gap_us[0]), int(times_without_gap_us[-1])
+            longest_gap_free_times_us = max(np.split(increasing_times_us, gap_rows), key=len)
+            return int(longest_gap_free_times_us[0]), int(longest_gap_free_times_us[-1])
     raise LogError(f"{name}: all timestamps are zero", "Record the flight again.")
 
 

@@ -120,7 +120,7 @@ def _draw_normalised_innovations(axes: style.Axes, aid_log: AidLog, span_s: Span
         innovations = samples[f"innovation_{axis}"] / np.sqrt(samples[f"variance_{axis}"])
         for is_drawn, dot_style in (
             (is_fused, style.INNOVATION_STYLES["EKF2"]),
-            (~is_fused, style.REJECTED_STYLE),
+            (~is_fused, style.REJECTED_INNOVATION_STYLE),
         ):
             marker_style = dot_style | {"ms": 1.4}
             draw_dots(axes, innovations[is_drawn], MAX_DRAWN_SIGMAS, marker_style)

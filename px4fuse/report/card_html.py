@@ -7,7 +7,7 @@ from px4fuse.card.build import build_card, describe_axis
 from px4fuse.card.model import (
     RATIO_AXIS_ENDS,
     RATIO_AXIS_TICKS,
-    Card,
+    DiagnosisCard,
     Verdict,
     map_ratio_to_axis,
 )
@@ -35,7 +35,7 @@ SIGMA_RATIO_AXIS = {
 }
 
 
-def make_diagnosis_card(analysis: Analysis) -> Card:
+def make_diagnosis_card(analysis: Analysis) -> DiagnosisCard:
     """Return the diagnosis card: faults, causes and actions of an analysis."""
     if analysis.request is None:
         raise SettingsError(
@@ -46,7 +46,9 @@ def make_diagnosis_card(analysis: Analysis) -> Card:
     return card_text.with_typed_path(card, analysis.request.log)
 
 
-def make_card_html(card: Card, *, is_open: bool = False, has_apply_buttons: bool = False) -> str:
+def make_card_html(
+    card: DiagnosisCard, *, is_open: bool = False, has_apply_buttons: bool = False
+) -> str:
     """Return a diagnosis card as an HTML element.
 
     Parameters
@@ -99,7 +101,7 @@ def read_card_css() -> str:
     return read_asset("card.css", "px4fuse.report")
 
 
-def make_notebook_html(card: Card) -> str:
+def make_notebook_html(card: DiagnosisCard) -> str:
     """Return a diagnosis card as HTML with CSS, for a notebook."""
     colour_css = read_asset("colours.css").replace(":root", ".px4fuse-card")
     return f"<style>{colour_css}{read_card_css()}</style>{make_card_html(card, is_open=True)}"

@@ -15,9 +15,9 @@ from px4fuse.card.model import (
     RATIO_AXIS_TICKS,
     Action,
     AidConsistency,
-    Card,
     CardRerun,
     DiagnosedCause,
+    DiagnosisCard,
     Verdict,
     map_ratio_to_axis,
 )
@@ -28,8 +28,9 @@ from px4fuse.finding import MAX_LISTED_SPANS, format_spans
 from px4fuse.request import quote_command
 
 CARD_WIDTH = 100  # characters per line
-AXIS_WIDTH = 33  # characters of the axis of σ ratios (actual σ ÷ reported σ), without its ends
-AXIS_INDENT = 57  # characters left of the axis of σ ratios
+# Width (characters) of the axis of σ ratios (actual σ ÷ reported σ), without its ends
+SIGMA_RATIO_AXIS_WIDTH = 33
+SIGMA_RATIO_AXIS_INDENT = 57  # characters left of the axis of σ ratios
 TEXT_INDENT = 11  # characters left of a text, which contain its label
 # Ticks with labels on the axis of σ ratios
 LABELLED_RATIO_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
@@ -114,7 +115,7 @@ class Paragraph(NamedTuple):
         return [self.text.rstrip()] if self.text.strip() else []
 
 
-def format_card_lines(card: Card) -> Iterator[Paragraph]:
+def format_card_lines(card: DiagnosisCard) -> Iterator[Paragraph]:
     if card.severity == "refused":
         yield Paragraph(f"error[{card.id}]: {card.headline}", style=SEVERITY_STYLES["error"])
         for label, text in card.facts.items():
@@ -143,11 +144,11 @@ def format_card_lines(card: Card) -> Iterator[Paragraph]:
         yield Paragraph(text, "  ", "  ")
     if card.notes:
         yield Paragraph("")
-    for text in note_texts(card):
+    for text in format_notes(card):
         yield Paragraph(text, "", "  ")
 
 
-def note_texts(card: Card) -> list[str]:
+def format_notes(card: DiagnosisCard) -> list[str]:
     """Format the first notes of a diagnosis card, and state where the others are."""
     texts = [
         f"note[{note.id}]: {note.text} {note.action}".rstrip() for note in card.notes[:MAX_NOTES]
@@ -157,7 +158,7 @@ def note_texts(card: Card) -> list[str]:
     return texts
 
 
-def format_closing_lines(card: Card, *, verbose: bool = False) -> Iterator[Paragraph]:
+def format_closing_lines(card: DiagnosisCard, *, verbose: bool = False) -> Iterator[Paragraph]:
     """Yield the last line of a diagnosis card: commands for details."""
     texts = [] if verbose else ["More: -v"]
     if card.id:
@@ -165,14 +166,14 @@ def format_closing_lines(card: Card, *, verbose: bool = False) -> Iterator[Parag
     yield Paragraph("; ".join(texts), wrap_indent="")
 
 
-def with_typed_path(card: Card, path: str) -> Card:
+def with_typed_path(card: DiagnosisCard, path: str) -> DiagnosisCard:
     """Replace the file name of the log in all commands by the path that the user typed.
 
     >>> from px4fuse.card.model import AnalysisDescription
     >>> action = Action("KF", commands=("px4fuse compare a.ulg --sigma-z 1",), where="shell")
     >>> cause = DiagnosedCause(id="x", severity="error", title="", why="", actions=(action,))
     >>> log = AnalysisDescription(file="a.ulg")
-    >>> card = Card(severity="error", headline="", causes=(cause,), identity=log)
+    >>> card = DiagnosisCard(severity="error", headline="", causes=(cause,), identity=log)
     >>> with_typed_path(card, "my logs/a.ulg").causes[0].actions[0].commands
     ("px4fuse compare 'my logs/a.ulg' --sigma-z 1",)
     """
@@ -183,7 +184,7 @@ def with_typed_path(card: Card, path: str) -> Card:
             return element
         return command.sub(lambda match: match[1] + quote_command([path]), element)
 
-    return convert(convert_nested(to_builtins(card), replace_name), Card)
+    return convert(convert_nested(to_builtins(card), replace_name), DiagnosisCard)
 
 
 def to_ascii(text: str) -> str:
@@ -225,10 +226,10 @@ def draw_sigma_ratio(ratio: float | None, reference: Reference) -> str:
     )
     characters = [
         "░" if first_band_column <= column <= last_band_column else "─"
-        for column in range(AXIS_WIDTH)
+        for column in range(SIGMA_RATIO_AXIS_WIDTH)
     ]
     if ratio is not None:
-        column, last_column = _map_ratio_to_character_column(ratio), AXIS_WIDTH - 1
+        column, last_column = _map_ratio_to_character_column(ratio), SIGMA_RATIO_AXIS_WIDTH - 1
         symbol = (
             "◀" if column < 0 else "▶" if column > last_column else SYMBOL_BY_REFERENCE[reference]
         )
@@ -256,10 +257,10 @@ def locate_sigma_ratio(
 
 
 def _map_ratio_to_character_column(ratio: float) -> int:
-    return round(map_ratio_to_axis(ratio) * (AXIS_WIDTH - 1))
+    return round(map_ratio_to_axis(ratio) * (SIGMA_RATIO_AXIS_WIDTH - 1))
 
 
-def _format_identity_lines(card: Card) -> Iterator[Paragraph]:
+def _format_identity_lines(card: DiagnosisCard) -> Iterator[Paragraph]:
     identity = card.identity
     student_text = ", ".join(filter(None, (identity.student, identity.student_id)))
     texts = (identity.file, ", ".join(list_flight_texts(card)), student_text)
@@ -271,7 +272,7 @@ def _format_identity_lines(card: Card) -> Iterator[Paragraph]:
     yield Paragraph("")
 
 
-def list_flight_texts(card: Card) -> list[str]:
+def list_flight_texts(card: DiagnosisCard) -> list[str]:
     """Return firmware, hardware, duration and position source of a flight."""
     identity = card.identity
     duration_text = f"{identity.duration_s:.1f} s"
@@ -279,7 +280,7 @@ def list_flight_texts(card: Card) -> list[str]:
     return [text for text in texts if text]
 
 
-def make_headline(card: Card) -> Paragraph:
+def make_headline(card: DiagnosisCard) -> Paragraph:
     """Return the first line of a diagnosis card: severity and title of the worst fault."""
     label = "ok" if card.severity == "clean" else card.severity
     severity_and_id = f"{label}[{card.id}]" if card.id else label
@@ -382,7 +383,7 @@ def _format_percent(fraction: float) -> str:
     return f"{100.0 * fraction:.0f}"
 
 
-def _format_verdict_lines(card: Card) -> Iterator[Paragraph]:
+def _format_verdict_lines(card: DiagnosisCard) -> Iterator[Paragraph]:
     if not card.verdicts:
         return
     direction_text = "" if card.effect is None else f" {card.effect.axis}"
@@ -392,9 +393,11 @@ def _format_verdict_lines(card: Card) -> Iterator[Paragraph]:
     legend = f"  ░ consistent ({format_consistent_ratios()})"
     left_end, right_end = "← reported σ too large", "too small →"
     # the plot has 8 more characters than its axis: the labels of the ends
-    right_end_width = AXIS_WIDTH + 8 - len(left_end)
-    yield Paragraph(f"{'':{AXIS_INDENT}}", plot=f"{left_end}{right_end:>{right_end_width}}")
-    yield Paragraph(f"{legend:{AXIS_INDENT}}", plot=_format_tick_labels())
+    right_end_width = SIGMA_RATIO_AXIS_WIDTH + 8 - len(left_end)
+    yield Paragraph(
+        f"{'':{SIGMA_RATIO_AXIS_INDENT}}", plot=f"{left_end}{right_end:>{right_end_width}}"
+    )
+    yield Paragraph(f"{legend:{SIGMA_RATIO_AXIS_INDENT}}", plot=_format_tick_labels())
     if any(verdict.is_explained for verdict in card.verdicts):
         yield Paragraph("  Verdicts in brackets need no action.")
     yield from map(_format_verdict_line, card.verdicts)
@@ -408,14 +411,14 @@ def _format_verdict_line(verdict: Verdict) -> Paragraph:
     verdict_word = f"({verdict.word})" if verdict.is_explained else verdict.word
     verdict_text = f"{label_text}{format_ratio(verdict.ratio):>5}  {verdict_word}"
     return Paragraph(
-        f"{verdict_text:{AXIS_INDENT}}",
+        f"{verdict_text:{SIGMA_RATIO_AXIS_INDENT}}",
         style="bold" if verdict.is_fault else "",
         plot=draw_sigma_ratio(verdict.ratio, verdict.against),
     )
 
 
 def _format_tick_labels() -> str:
-    characters = [" "] * AXIS_WIDTH
+    characters = [" "] * SIGMA_RATIO_AXIS_WIDTH
     for tick in LABELLED_RATIO_TICKS[1:-1]:
         label = RATIO_AXIS_TICKS[tick]
         start = _map_ratio_to_character_column(tick) - len(label) // 2

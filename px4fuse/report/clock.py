@@ -20,7 +20,7 @@ from px4fuse.core.text import format_metres
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.finding import Finding
 from px4fuse.findings.source_clock import (
-    compute_offset_for_option_s,
+    compute_clock_offset_option_s,
     find_offset_rerun,
     truth_refutes_offset,
 )
@@ -93,7 +93,7 @@ def make_time_offset_advice(
     }
     if time_offset.is_significant(offset_s):
         late_or_early = "late" if offset_s < 0.0 else "early"
-        suggested_offset_s = compute_offset_for_option_s(comparison, time_offset)
+        suggested_offset_s = compute_clock_offset_option_s(comparison, time_offset)
         advice_by_label = {
             "Result": f"The position timestamps are {abs(offset_s):.3f} s {late_or_early}.",
             "Offset": f"Add {offset_text} to the timestamps of the position source.",
@@ -108,10 +108,12 @@ def make_time_offset_advice(
     if (logged_delay_ms := find_logged_delay_ms(comparison)) is not None:
         advice_by_label["PX4"] = _format_delay_advice(comparison, time_offset, logged_delay_ms)
     if time_offset.has_changed():
-        offset_texts = ", ".join(
+        part_offsets_text = ", ".join(
             f"{part.offset_s:+.2f} s from {part.start_s:.0f} s" for part in time_offset.parts
         )
-        advice_by_label["Changes"] = f"The time offset changes during the flight: {offset_texts}."
+        advice_by_label["Changes"] = (
+            f"The time offset changes during the flight: {part_offsets_text}."
+        )
     faults = find_convention_faults(
         comparison.convention, comparison.flight, comparison.source.frame
     )
@@ -176,14 +178,14 @@ def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]
 def _draw_likelihood(axes: Axes, time_offset: SourceTimeOffset) -> None:
     """Draw the log-likelihood of the positions over the time offset."""
     low_s, high_s = time_offset.interval_s
-    offsets_s, drops = (
+    offsets_s, log_likelihood_drops = (
         time_offset.likelihood_curve_offsets_s,
         time_offset.curve_log_likelihood_drops,
     )
     is_near = np.abs(offsets_s - time_offset.offset_s) <= CURVE_TO_INTERVAL_RATIO * (high_s - low_s)
     axes.axvspan(low_s, high_s, color=KF_BAND_COLOUR, lw=0, label="95 % interval")
-    axes.plot(offsets_s[is_near], drops[is_near], **TRACK_STYLES["KF"])
+    axes.plot(offsets_s[is_near], log_likelihood_drops[is_near], **TRACK_STYLES["KF"])
     axes.axvline(time_offset.applied_s, color="black", lw=0.8, ls="--", label="as analysed")
-    axes.set_ylim(1.05 * drops[is_near].max(), 0.0)
+    axes.set_ylim(1.05 * log_likelihood_drops[is_near].max(), 0.0)
     axes.set_xlabel("offset added to the source's timestamps (s)")
     draw_legend_above(axes)

@@ -48,7 +48,7 @@ MAX_AUTOCORRELATION_LAG = 20
 MAX_DRAWN_SIGMAS = 4.0
 HISTOGRAM_EDGES = np.linspace(-MAX_DRAWN_SIGMAS, MAX_DRAWN_SIGMAS, 33)
 RUNNING_NIS_HEIGHT = 140.0  # points
-DISTRIBUTION_HEIGHT = 150.0  # points
+DISTRIBUTION_PLOT_HEIGHT = 150.0  # points
 InnovationsByFilter = Mapping[str, "pd.Series[float]"]
 
 
@@ -67,9 +67,9 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
         )
         _draw_running_nis(nis_axes, innovations)
         left_column, right_column = make_columns()
-        histogram_axes = left_column.add_panel("Distribution of ν/√S", DISTRIBUTION_HEIGHT)
+        histogram_axes = left_column.add_panel("Distribution of ν/√S", DISTRIBUTION_PLOT_HEIGHT)
         _draw_histogram(histogram_axes, innovations)
-        autocorrelation_axes = right_column.add_panel("Autocorrelation", DISTRIBUTION_HEIGHT)
+        autocorrelation_axes = right_column.add_panel("Autocorrelation", DISTRIBUTION_PLOT_HEIGHT)
         _draw_autocorrelation(autocorrelation_axes, innovations)
         for axes in (nis_axes, histogram_axes, autocorrelation_axes):
             draw_legend_above(axes)

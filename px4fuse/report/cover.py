@@ -13,8 +13,8 @@ from px4fuse.analysis import AidingSourceAnalysis, Analysis
 from px4fuse.card.model import (
     RATIO_AXIS_TICKS,
     AidConsistency,
-    Card,
     DiagnosedCause,
+    DiagnosisCard,
     Verdict,
     map_ratio_to_axis,
 )
@@ -24,10 +24,10 @@ from px4fuse.comparison.comparison import (
 )
 from px4fuse.comparison.model import FILTER_NAMES, select_north_and_east
 from px4fuse.core.arrays import Array
-from px4fuse.core.text import format_metres, format_ratio, one_line
+from px4fuse.core.text import format_metres, format_ratio, shorten_to_line
 from px4fuse.filter.consistency import Reference
 from px4fuse.filter.kalman import predict_track
-from px4fuse.filter.signals import AISLE, cut_to_segment
+from px4fuse.filter.signals import AISLE_AXIS, cut_to_segment
 from px4fuse.finding import format_spans
 from px4fuse.flight.model import Ekf2, Truth
 from px4fuse.report import style
@@ -36,12 +36,12 @@ from px4fuse.report.card_text import (
     QUANTITY_LABELS,
     SEVERITY_SIGNS,
     format_consistent_ratios,
+    format_notes,
     format_rerun_note,
     label_alternatives,
     list_flight_texts,
     locate_sigma_ratio,
     make_rerun_rows,
-    note_texts,
 )
 from px4fuse.report.page import (
     AXES_LEFT_MARGIN,
@@ -90,14 +90,14 @@ def draw_pages(analysis: Analysis | AidingSourceAnalysis, results: FlightResults
     yield page
 
 
-def add_card(page: Page, card: Card) -> None:
+def add_card(page: Page, card: DiagnosisCard) -> None:
     """Add a diagnosis card (faults, causes and actions) to a page."""
     direction_text = f", {card.effect.axis}" if card.effect else ""
     ratio_text = f"RMS of actual error ÷ reported σ{direction_text}"
     formatted_fields = {
         "sign": SEVERITY_SIGNS[card.severity],
         "colour": SEVERITY_COLOURS[card.severity],
-        "file": one_line(card.identity.file, MAX_FILE_NAME_LENGTH),
+        "file": shorten_to_line(card.identity.file, MAX_FILE_NAME_LENGTH),
         "flight": " · ".join(list_flight_texts(card)),
         "axis_text": AIDS_CAPTION if card.aids else ratio_text,
         "axis_legend": f"grey: ratio of a consistent filter ({format_consistent_ratios()}) · ━ 95 "
@@ -105,7 +105,7 @@ def add_card(page: Page, card: Card) -> None:
         "ticks": [(map_ratio_to_axis(tick), label) for tick, label in RATIO_AXIS_TICKS.items()],
         "rows": [*map(_make_verdict_row, card.verdicts), *map(_make_aid_row, card.aids)],
         "causes": list(map(_make_cause_fields, card.causes)),
-        "notes": note_texts(card),
+        "notes": format_notes(card),
         "terms": AIDS_TERMS_NOTE if card.aids else TERMS_NOTE,
     }
     page.add("cover", **structs.asdict(card) | formatted_fields)
@@ -166,7 +166,7 @@ def _make_cause_fields(cause: DiagnosedCause) -> dict[str, Any]:
     return structs.asdict(cause) | formatted_fields
 
 
-def write_panels(page: Page, analysis: Analysis, card: Card) -> None:
+def write_panels(page: Page, analysis: Analysis, card: DiagnosisCard) -> None:
     """Draw map, position errors and innovations, together on the first or on the second page."""
     section, (left_column, right_column) = Page(), make_columns()
     add_legend(section, analysis)
@@ -177,7 +177,7 @@ def write_panels(page: Page, analysis: Analysis, card: Card) -> None:
     page.add_columns(section)
 
 
-def _draw_error_plots(page: Page, analysis: Analysis, card: Card) -> None:
+def _draw_error_plots(page: Page, analysis: Analysis, card: DiagnosisCard) -> None:
     """Draw the position errors of KF and EKF2, or their difference."""
     result, effect = analysis.main.with_whole_flight_tracks(), card.effect
     plots: list[tuple[str, float | None, pd.Series[float], SigmaByFilter]] = []
@@ -226,11 +226,15 @@ def _draw_error_plot(
         name: sigma.dropna() for name, sigma in sigmas_m.items() if sigma.notna().any()
     }
     title += " –" if rms_m is None else f" {format_metres(rms_m)}"
-    is_difference = len(sigmas_m) > 1
+    is_difference_of_filters = len(sigmas_m) > 1
     for name, sigma in known_sigmas_m.items():
-        label = f"σ of {name}" if is_difference else "σ"
+        label = f"σ of {name}" if is_difference_of_filters else "σ"
         title += f", median {label} {format_metres(sigma.median())}"
-    line = style.line_style("black", 1.0) if is_difference else TRACK_STYLES[next(iter(sigmas_m))]
+    line = (
+        style.line_style("black", 1.0)
+        if is_difference_of_filters
+        else TRACK_STYLES[next(iter(sigmas_m))]
+    )
 
     axes = add_time_panel(page, analysis, title, PLOT_HEIGHT, with_time_label=False)
     axes.set_ylim(-half_range_m, half_range_m)
@@ -242,7 +246,7 @@ def _draw_error_plot(
 
 def _draw_innovations(page: Page, analysis: Analysis) -> None:
     innovations = normalised_innovations(analysis.main)
-    legend = ", ".join(f"{style.INNOVATION_SIGNS[name]} {name}" for name in innovations)
+    legend = ", ".join(f"{style.INNOVATION_SYMBOLS[name]} {name}" for name in innovations)
     title = f"Innovations ÷ √S ({legend}): 95 % expected within ±2; ▲▼ beyond ±{MAX_DRAWN_SIGMAS:g}"
     axes = add_time_panel(page, analysis, title, PLOT_HEIGHT)
     axes.set(ylim=(-1.12 * MAX_DRAWN_SIGMAS, 1.12 * MAX_DRAWN_SIGMAS), yticks=(-2.0, 2.0))
@@ -259,7 +263,7 @@ def _rotate_map_tracks(analysis: Analysis) -> tuple[dict[str, Array], tuple[str,
     the right, m upwards.
     """
     aisle_heading_deg = next(
-        (line.heading_deg for line in analysis.input_axes if line.name == AISLE), None
+        (line.heading_deg for line in analysis.input_axes if line.name == AISLE_AXIS), None
     )
     heading_rad, labels = np.pi / 2.0, ("east", "north")
     if aisle_heading_deg is not None:

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.ekf2.replay import Agreement
+from px4fuse.ekf2.replay import ReplayAgreement
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.flight.model import Unavailable
@@ -84,7 +84,7 @@ def describe_missing_explanation(analysis: Analysis) -> str:
     )
 
 
-def format_replay_agreement(agreement: Agreement) -> str:
+def format_replay_agreement(agreement: ReplayAgreement) -> str:
     sentences = [
         f"{'agrees' if agreement.good else 'does not agree'} with the log ({agreement.reason})",
         *(
@@ -100,12 +100,16 @@ def _draw_contributions(
     column: Page,
     title: str,
     reduction_by_setting: Mapping[str, float],
-    unexplained: float,
-    total: float,
+    unexplained_mean_square: float,
+    total_mean_square: float,
 ) -> None:
     """Draw the contribution (%) of each setting to the mean square difference KF - EKF2."""
     names = [*reduction_by_setting, "unexplained"]
-    percents = 100.0 / total * np.array([*reduction_by_setting.values(), unexplained])
+    percents = (
+        100.0
+        / total_mean_square
+        * np.array([*reduction_by_setting.values(), unexplained_mean_square])
+    )
     axes = column.add_panel(title, BAR_ROW_HEIGHT * len(names), left_margin=LABEL_WIDTH)
     rows = range(len(names))
     axes.barh(rows, percents, height=0.7, color=KF_BAND_COLOUR, edgecolor=KF_COLOUR, lw=0.6)

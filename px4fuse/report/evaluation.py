@@ -13,15 +13,15 @@ from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.report import style
 from px4fuse.report.page import Page, make_columns
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, TRUTH_COLOUR, Axes
-from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
+from px4fuse.trajectory.evaluation import AbsoluteTrajectoryError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME
-from px4fuse.trajectory.scores import RelativeError, RmseInterval, Statistics
+from px4fuse.trajectory.scores import RelativePoseError, RmseInterval, Statistics
 
 # Indices of the position axes to the right and upwards on a map, by frame
 MAP_AXIS_INDICES = {"NED": (1, 0), "FRD": (1, 0), "camera": (0, 2)}
 # Minimum pose interval of a gap in the drawn path, in median intervals
-MIN_GAP_INTERVAL_RATIO = 10.0
-MIN_ERROR_RANGE_M = 1e-3  # so that rounding errors look small
+MIN_GAP_TO_MEDIAN_INTERVAL_RATIO = 10.0
+MIN_DRAWN_ERROR_RANGE_M = 1e-3  # so that rounding errors look small
 ERROR_PLOT_HEIGHT = 110.0  # points
 MAP_HEIGHT = 150.0  # points
 COLOUR_BAR_MARGIN = 40.0  # points
@@ -84,7 +84,7 @@ def _draw_path(axes: Axes, evaluation: Evaluation, axis_indices: list[int]) -> N
         cmap="copper_r",  # differs in greyscale too
         linewidths=0,
         vmin=0.0,
-        vmax=max(float(error_m.max()), MIN_ERROR_RANGE_M),
+        vmax=max(float(error_m.max()), MIN_DRAWN_ERROR_RANGE_M),
     )
     reference_m = evaluation.reference_position_m[:, axis_indices]
     plot_path(axes, reference_m, evaluation.time_s, label="reference", **REFERENCE_LINE_STYLE)
@@ -105,14 +105,14 @@ def _draw_ape(page: Page, evaluation: Evaluation) -> None:
     axes = page.add_panel(title, ERROR_PLOT_HEIGHT)
     style.draw_curve(axes, error_m, color=KF_COLOUR, lw=0.8)
     axes.axhline(rmse_m, **style.line_style(EKF2_COLOUR, 1.4))
-    axes.set_ylim(0.0, 1.08 * max(error_m.max(), MIN_ERROR_RANGE_M))
+    axes.set_ylim(0.0, 1.08 * max(error_m.max(), MIN_DRAWN_ERROR_RANGE_M))
     axes.set_xlabel("time from the first pose (s)" if time_origin_s else "time (s)")
 
 
 def plot_path(axes: Axes, positions_m: Array, time_s: Array, **style: Any) -> None:
     """Draw a path, shape (n, 2), with its gaps in time."""
     intervals_s = np.diff(time_s)
-    is_gap = intervals_s > MIN_GAP_INTERVAL_RATIO * np.median(intervals_s)
+    is_gap = intervals_s > MIN_GAP_TO_MEDIAN_INTERVAL_RATIO * np.median(intervals_s)
     gap_indices = np.flatnonzero(is_gap) + 1
     axes.plot(*np.insert(positions_m, gap_indices, np.nan, axis=0).T, **style)
 
@@ -129,12 +129,12 @@ def _write_evaluation(page: Page, evaluation: Evaluation) -> None:
         ("Against", evaluation.reference_track),
     ):
         duration_s = track.time_s[-1] - track.time_s[0]
-        page.write_labelled(
+        page.write_labelled_text(
             label,
             f"{track.name}: {track.kind}, {len(track)} poses over {duration_s:.1f} s, frame "
             f"{track.frame}",
         )
-    page.write_labelled("Method", describe_method(evaluation))
+    page.write_labelled_text("Method", describe_method(evaluation))
     _write_warnings(page, evaluation)
     head = "error", "RMSE", "mean (m)", "median (m)", "std (m)", "max (m)", "n", "rotation RMSE (°)"
     page.add_table(head, _make_error_rows(evaluation), right_aligned_columns=range(2, len(head)))
@@ -169,27 +169,32 @@ def _write_warnings(page: Page, evaluation: Evaluation) -> None:
 
 
 def _make_error_rows(evaluation: Evaluation) -> list[list[str]]:
-    error_by_name: dict[str, AbsoluteError | RelativeError] = {"ATE": evaluation.ate}
+    error_by_name: dict[str, AbsoluteTrajectoryError | RelativePoseError] = {"ATE": evaluation.ate}
     error_by_name |= {f"RPE over {error.delta_text}": error for error in evaluation.rpe}
     rows = []
     for name, error in error_by_name.items():
-        errors_m, cells = error.translation_m, [""] * 5
-        if isinstance(errors_m, Statistics):
-            numbers = (errors_m.mean, errors_m.median, errors_m.std, errors_m.max)
-            cells = [*(f"{number:.3f}" for number in numbers), f"{errors_m.count}"]
+        translation_errors_m, cells = error.translation_m, [""] * 5
+        if isinstance(translation_errors_m, Statistics):
+            numbers = (
+                translation_errors_m.mean,
+                translation_errors_m.median,
+                translation_errors_m.std,
+                translation_errors_m.max,
+            )
+            cells = [*(f"{number:.3f}" for number in numbers), f"{translation_errors_m.count}"]
         rows.append([name, format_error(error), *cells, format_rmse(error.rotation_deg, 2)])
     return rows
 
 
-def format_error(error: AbsoluteError | RelativeError) -> str:
+def format_error(error: AbsoluteTrajectoryError | RelativePoseError) -> str:
     """Format the RMSE of positions with its 95 % interval."""
-    errors_m, interval = error.translation_m, error.interval_m
-    if isinstance(errors_m, Unavailable):
+    translation_errors_m, interval = error.translation_m, error.interval_m
+    if isinstance(translation_errors_m, Unavailable):
         return "–"
     interval_text = ""
     if isinstance(interval, RmseInterval):
         interval_text = f" (95 % {interval.low:.3f} to {interval.high:.3f})"
-    return f"{errors_m.rmse:.3f} m{interval_text}"
+    return f"{translation_errors_m.rmse:.3f} m{interval_text}"
 
 
 def describe_unaligned_rmse(evaluation: Evaluation) -> str:
@@ -206,16 +211,16 @@ def describe_unaligned_rmse(evaluation: Evaluation) -> str:
     )
 
 
-def describe_rpe_growth(rpe: tuple[RelativeError, ...]) -> str:
+def describe_rpe_growth(rpe: tuple[RelativePoseError, ...]) -> str:
     """Describe the growth of the relative pose error (RPE) with distance or time."""
     # Distances, times and numbers of frames cannot be compared: use the most frequent unit
     units = [error.unit for error in rpe]
     unit = max(units, key=units.count, default="")
     rmse_by_delta = {
-        error.delta: errors_m.rmse
+        error.delta: translation_errors_m.rmse
         for error in rpe
-        if isinstance(errors_m := error.translation_m, Statistics)
-        and errors_m.rmse > NEGLIGIBLE_ERROR_M
+        if isinstance(translation_errors_m := error.translation_m, Statistics)
+        and translation_errors_m.rmse > NEGLIGIBLE_ERROR_M
         and error.unit == unit
     }
     if not rmse_by_delta:

@@ -1,13 +1,13 @@
 """Terminal output of ``px4fuse explain``: detectable faults and their meaning."""
 
-from px4fuse.core.text import capitalise_first
+from px4fuse.core.text import capitalise_first_letter
 from px4fuse.errors import SettingsError, suggest_name
 from px4fuse.findings.model import (
     EFFECTS_BY_CAUSE,
     FINDING_CATALOGUE,
     FINDING_GROUPS,
     find_effect_ids,
-    load_examples,
+    load_finding_examples,
 )
 from px4fuse.report.page import Page
 
@@ -16,7 +16,7 @@ def make_findings_list() -> Page:
     """List all detectable faults (findings)."""
     page = Page()
     for group in FINDING_GROUPS:
-        page.write_heading(capitalise_first(group))
+        page.write_heading(capitalise_first_letter(group))
         rows = [
             (name, finding.title)
             for name, finding in FINDING_CATALOGUE.items()
@@ -40,20 +40,20 @@ def make_finding_page(finding_id: str) -> Page:
             f"{finding_id!r} is not a finding",
             f"{suggest_name(name, FINDING_CATALOGUE)}For a list of findings, run px4fuse explain.",
         )
-    finding, example = FINDING_CATALOGUE[name], load_examples()[name]
+    finding, example = FINDING_CATALOGUE[name], load_finding_examples()[name]
     causes = [cause for cause in EFFECTS_BY_CAUSE if name in find_effect_ids(cause)]
     page = Page()
     page.write(f"{finding.title}  [{name}]", bold=True)
-    page.write_labelled("Meaning", finding.meaning)
+    page.write_labelled_text("Meaning", finding.meaning)
     if example.message:
-        page.write_labelled("Example", example.message)
-        page.write_labelled("Action", example.remedy)
+        page.write_labelled_text("Example", example.message)
+        page.write_labelled_text("Action", example.remedy)
     for label, text, finding_ids in (
         ("Causes", f"Findings that can cause {name}", causes),
         ("Effects", f"Findings that {name} can cause", find_effect_ids(name)),
     ):
         if finding_ids:
-            page.write_labelled(label, f"{text}: {', '.join(finding_ids)}")
+            page.write_labelled_text(label, f"{text}: {', '.join(finding_ids)}")
     rate_sentences = [
         "The rates of false alarms and of detection have not been measured for this finding."
     ]
@@ -68,5 +68,5 @@ def make_finding_page(finding_id: str) -> Page:
             "Detected fraction of the simulated flights with the injected fault: "
             f"{'; '.join(detection_rate_texts)}.",
         ]
-    page.write_labelled("Rates", *rate_sentences)
+    page.write_labelled_text("Rates", *rate_sentences)
     return page

@@ -15,7 +15,7 @@ from px4fuse.report.phrases import get_statistics_by_filter, list_verdict_warnin
 from px4fuse.report.style import EKF2_COLOUR, TRACK_STYLES
 
 ZOOM_UPDATE_COUNT = 15  # in the enlarged plot of σ of position
-MIN_ZOOM_S = 1.0  # minimum duration of the enlarged plot
+MIN_ZOOM_DURATION_S = 1.0  # minimum duration of the enlarged plot
 TRACK_PANELS = (panels.POSITION_PANEL, panels.VELOCITY_PANEL)
 INNOVATION_PANELS = (
     panels.INNOVATIONS_PANEL,
@@ -77,7 +77,7 @@ def find_zoom_span(result: AxisComparison) -> Span:
     update_times_s = result.kf_run.updates.index.to_numpy()
     start_s = float(update_times_s[len(update_times_s) // 2])
     interval_s = np.median(np.diff(update_times_s)) if len(update_times_s) > 1 else 0.0
-    return start_s, start_s + max(float(ZOOM_UPDATE_COUNT * interval_s), MIN_ZOOM_S)
+    return start_s, start_s + max(float(ZOOM_UPDATE_COUNT * interval_s), MIN_ZOOM_DURATION_S)
 
 
 def _describe_sigma_at_updates(result: AxisComparison) -> str:
@@ -87,13 +87,14 @@ def _describe_sigma_at_updates(result: AxisComparison) -> str:
         "EKF2: ▵ before and ▿ after an update, □ logged σ.",
     ]
     for name, filter_summary in get_statistics_by_filter(result).items():
-        sigma_before_m = filter_summary.sigma_p_before_update_m
-        sigma_after_m = filter_summary.sigma_p_after_update_m
-        if sigma_before_m is None or sigma_after_m is None:
+        sigma_before_update_m = filter_summary.sigma_p_before_update_m
+        sigma_after_update_m = filter_summary.sigma_p_after_update_m
+        if sigma_before_update_m is None or sigma_after_update_m is None:
             sentences.append(f"{name}: σ before and after an update is unknown.")
         else:
             sentences.append(
-                f"{name}: an update reduces σ from {sigma_before_m:.3f} to {sigma_after_m:.3f} m."
+                f"{name}: an update reduces σ from {sigma_before_update_m:.3f} to "
+                f"{sigma_after_update_m:.3f} m."
             )
     return " ".join(sentences)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from matplotlib import font_manager
 from matplotlib.font_manager import FontEntry, FontPath
 
-from px4fuse.core.text import one_line
+from px4fuse.core.text import shorten_to_line
 from px4fuse.report.style import FONT
 
 # Names of placeholder fonts, which draw each character as a box
@@ -52,7 +52,7 @@ def find_missing_characters(text: str) -> str:
 
 
 def format_font_advice(characters: str) -> str:
-    listed_characters = one_line(characters, MAX_LISTED_CHARACTERS)
+    listed_characters = shorten_to_line(characters, MAX_LISTED_CHARACTERS)
     return (
         f"No installed font has the characters {listed_characters}; the report shows "
         f"{MISSING_GLYPH_SYMBOL} instead. Install a font with these characters, for "
@@ -68,8 +68,8 @@ def _find_non_ascii_characters(text: str) -> list[str]:
 def _list_fonts_except_dejavu() -> tuple[tuple[str, FontPath], ...]:
     """Return names and paths of installed fonts except DejaVu Sans, in order of preference."""
     manager = font_manager.fontManager
-    known_paths = {str(entry.fname) for entry in manager.ttflist}
-    for path in sorted(set(font_manager.findSystemFonts()) - known_paths):
+    known_font_paths = {str(entry.fname) for entry in manager.ttflist}
+    for path in sorted(set(font_manager.findSystemFonts()) - known_font_paths):
         try:
             manager.addfont(path)
         except (OSError, RuntimeError, NotImplementedError):

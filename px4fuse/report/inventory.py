@@ -25,10 +25,10 @@ def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
         command = command_line(request, "compare", for_shell=True)
         page.add("command", text=command, label="Run")
     for advice in inventory.advice:
-        page.write_labelled("Action", f"{'; '.join(advice.improves)}: {advice.remedy}")
+        page.write_labelled_text("Action", f"{'; '.join(advice.improves)}: {advice.remedy}")
     for sender in inventory.flight.log.senders:
         lost_text = "unknown" if sender.lost_fraction is None else f"{sender.lost_fraction:.1%}"
-        page.write_labelled(
+        page.write_labelled_text(
             "Sender",
             f"{sender.system}/{sender.component}, {sender.description}"
             f"{' (this flight)' * sender.chosen}: {sender.messages} messages, lost: {lost_text}",
@@ -45,7 +45,7 @@ def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
     }
     for label, texts in texts_by_label.items():
         if texts:
-            page.write_labelled(label, *texts)
+            page.write_labelled_text(label, *texts)
     return page
 
 

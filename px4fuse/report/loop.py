@@ -6,7 +6,7 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.core.text import (
-    capitalise_first,
+    capitalise_first_letter,
     format_count,
     format_number,
     format_p_value,
@@ -157,8 +157,8 @@ def _write_ate(page: Page, loop: Loop) -> None:
 def _write_segment(page: Page, loop: Loop) -> None:
     odometry, true_end = loop.odometry.trajectory, loop.true_end
     true_end_text = "not used" if isinstance(true_end, Unavailable) else true_end.source
-    page.write_labelled("True end", true_end_text)
-    page.write_labelled(
+    page.write_labelled_text("True end", true_end_text)
+    page.write_labelled_text(
         "Track",
         f"{odometry.name}, {_format_span(loop)}, {loop.part_reason}: {len(odometry)} poses, "
         f"{loop.key_frames} key frames, spacing {loop.key_frame_spacing_m:.2g} m",
@@ -169,7 +169,8 @@ def _write_closures(page: Page, loop: Loop) -> None:
     for closure in loop.closures:
         verb = "accepted" if closure.accepted else "rejected"
         text = (
-            f"{capitalise_first(f'{closure}'.removeprefix('the '))}: {verb} by the χ² test (error "
+            f"{capitalise_first_letter(f'{closure}'.removeprefix('the '))}: {verb} by the χ² test "
+            "(error "
             f"{closure.distance_m:.2f} m, {format_p_value(closure.p)})"
         )
         if closure.weight_gnc is not None:
@@ -192,7 +193,7 @@ def _write_rpe(page: Page, loop: Loop) -> None:
             notes += [describe_method(first), *first.notes, *first.warnings]
             page.add_table(head, [_make_rpe_row(*evaluation) for evaluation in evaluations])
         for note in dict.fromkeys(notes):
-            page.write_muted_text(capitalise_first(note))
+            page.write_muted_text(capitalise_first_letter(note))
 
 
 def _make_rpe_row(path: PathResult, evaluation: Evaluation) -> list[str]:
@@ -232,17 +233,17 @@ def _describe_closure_error(loop: Loop) -> str:
 def make_pose_graph_page(graph: Graph) -> Page:
     """Make the terminal output of ``px4fuse loop`` for a solved pose graph."""
     page, gates = Page(), graph.gates
-    page.write_labelled(
+    page.write_labelled_text(
         "Graph",
         f"{graph.name}: {graph.dimension}-D, {graph.poses} poses, {graph.edges} edges; initial "
         f"poses: {graph.initialised}",
     )
     if graph.reduced_chi2_interval[1] > 0.0:  # 0: no degree of freedom, so no statement on the fit
-        page.write_labelled("Fit", _describe_graph_fit(graph))
+        page.write_labelled_text("Fit", _describe_graph_fit(graph))
     if isinstance(gates, Unavailable):
-        page.write_labelled("Gate", f"not applied: {gates.reason}")
+        page.write_labelled_text("Gate", f"not applied: {gates.reason}")
     elif not gates:
-        page.write_labelled("Gate", "the graph has no loop closures to test")
+        page.write_labelled_text("Gate", "the graph has no loop closures to test")
     else:
         gate_texts = [
             f"{gate.first} – {gate.second}: d² {gate.d2:.1f}, p {gate.p:.2g}"
@@ -251,9 +252,9 @@ def make_pose_graph_page(graph: Graph) -> Page:
         ]
         count_text = f"{len(gate_texts)} of {len(gates)} loop closures rejected"
         rejected_closure_lines = join_first_names(gate_texts, MAX_LISTED_CLOSURES, "\n").split("\n")
-        page.write_labelled("Gate", count_text, *rejected_closure_lines)
+        page.write_labelled_text("Gate", count_text, *rejected_closure_lines)
         if len(gates) > MAX_GNC_CLOSURES and len(graph.solutions) == 1:
-            page.write_labelled(
+            page.write_labelled_text(
                 "Robust",
                 "not solved, because the graph has many loop closures. Add --robust to solve it.",
             )
@@ -261,9 +262,10 @@ def make_pose_graph_page(graph: Graph) -> Page:
         label = SOLUTION_LABELS[key]
         if not solution.converged:
             not_converged_text = f"not converged: {label}. The cost is not at its minimum."
-            page.write_labelled("Solver", not_converged_text)
+            page.write_labelled_text("Solver", not_converged_text)
         text = (
-            f"{capitalise_first(label)}: cost {solution.cost_initial:.6g} → {solution.cost:.6g} in "
+            f"{capitalise_first_letter(label)}: cost {solution.cost_initial:.6g} → "
+            f"{solution.cost:.6g} in "
             f"{format_count(solution.iterations, 'iteration')}"
         )
         if key != "all":

@@ -46,7 +46,7 @@ def write_markdown(page: Page, notes: str) -> None:
     from markdown_it import MarkdownIt  # noqa: PLC0415
 
     parser = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
-    next_numbers = list[int]()  # number of the next item in each open list, unused for bullets
+    next_item_numbers = list[int]()  # number of the next item in each open list, unused for bullets
     # level: open list items and quotes; marker: bullet or number of a list item without text yet
     level, marker, previous_type, table_rows = 0, "", "", list[list[str]]()
     for token in parser.parse(notes):
@@ -58,12 +58,12 @@ def write_markdown(page: Page, notes: str) -> None:
         level += token.nesting if token.type.startswith(("list_item", "blockquote")) else 0
         match token.type:
             case "bullet_list_open" | "ordered_list_open":
-                next_numbers.append(int(token.attrs.get("start", 1)))
+                next_item_numbers.append(int(token.attrs.get("start", 1)))
             case "bullet_list_close" | "ordered_list_close":
-                next_numbers.pop()
+                next_item_numbers.pop()
             case "list_item_open":
-                marker = f"{next_numbers[-1]}." if token.info else "•"
-                next_numbers[-1] += 1
+                marker = f"{next_item_numbers[-1]}." if token.info else "•"
+                next_item_numbers[-1] += 1
             case "fence" | "code_block":
                 code = token.content.rstrip("\n").expandtabs(4).replace(" ", "\N{NO-BREAK SPACE}")
                 page.write(code, colour=MUTED_COLOUR, indent=indent + INDENT)

@@ -68,7 +68,7 @@ class Page:
     def write_muted_text(self, text: str) -> None:
         self.write(text, colour=MUTED_COLOUR)
 
-    def write_labelled(
+    def write_labelled_text(
         self,
         label: str,
         *texts: str | PageBlock,
@@ -81,7 +81,7 @@ class Page:
 
     def write_labelled_texts(self, texts: Mapping[str, str]) -> None:
         for label, text in texts.items():
-            self.write_labelled(label, text)
+            self.write_labelled_text(label, text)
 
     def add_table(
         self,

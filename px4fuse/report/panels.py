@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, Difference, FilterTracks
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, FilterDifference, FilterTracks
 from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -20,7 +20,7 @@ from px4fuse.report.page import Page, PageBlock
 from px4fuse.report.phrases import format_sigma_verdict, get_statistics_by_filter
 from px4fuse.report.style import (
     INNOVATION_STYLES,
-    REJECTED_STYLE,
+    REJECTED_INNOVATION_STYLE,
     TRACK_STYLES,
     Artist,
     Axes,
@@ -30,7 +30,7 @@ from px4fuse.report.style import (
     set_log_scale,
 )
 
-NARROW_AXES_HEIGHT = 72.0  # points
+NARROW_PLOT_HEIGHT = 72.0  # points
 # Limit of the innovation axis ÷ largest innovation that the axis must show
 INNOVATION_AXIS_MARGIN_FACTOR = 1.3
 # The axis shows innovations up to this multiple of the median √S
@@ -71,7 +71,7 @@ def _make_event_markers(
         EventMarkers("on the ground", events.ground_spans_s, ON_GROUND_BAND_STYLE),
         EventMarkers("position gap", events.gaps, GAP_BAND_STYLE),
         EventMarkers("log dropout", events.dropouts, DROPOUT_BAND_STYLE),
-        EventMarkers("EKF2 rejected", rejection_times_s, REJECTED_STYLE, 0.025),
+        EventMarkers("EKF2 rejected", rejection_times_s, REJECTED_INNOVATION_STYLE, 0.025),
         EventMarkers("outlier", find_outlier_times(analysis), OUTLIER_MARKER_STYLE, 0.075),
         EventMarkers("EKF2 reset", events.reset_times_s, RESET_MARKER_STYLE, 0.92),
         EventMarkers("take-off", events.take_off_times_s, TAKE_OFF_MARKER_STYLE, 0.0),
@@ -177,7 +177,7 @@ def draw_panels(
             page,
             analysis,
             panel.title,
-            NARROW_AXES_HEIGHT if is_narrow else panel.height,
+            NARROW_PLOT_HEIGHT if is_narrow else panel.height,
             axis=result.axis.name,
             with_time_label=panel is panels[-1],
             caption=". ".join(filter(None, texts)),
@@ -255,7 +255,7 @@ def _describe_errors(result: AxisComparison, quantity: QuantityColumns) -> str:
         if (rmse := getattr(filter_summary.truth, quantity.rmse_field_name, None)) is not None
     ]
     texts = [f"RMSE against ground truth {', '.join(rmse_texts)}"] if rmse_texts else []
-    if isinstance(result.difference, Difference):
+    if isinstance(result.difference, FilterDifference):
         difference_rms = getattr(result.difference, quantity.difference_field_name)
         texts.append(f"KF - EKF2 RMS {difference_rms:.3f} {quantity.unit}")
     return "; ".join(texts)
@@ -312,7 +312,7 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
         is_rejected = table.get("rejected", 0.0 * innovations) > 0
         draw_dots(axes, innovations[~is_rejected], plot_limit_m, INNOVATION_STYLES[name])
         if "rejected" in table:
-            draw_dots(axes, innovations[is_rejected], plot_limit_m, REJECTED_STYLE)
+            draw_dots(axes, innovations[is_rejected], plot_limit_m, REJECTED_INNOVATION_STYLE)
     axes.set_ylim(-1.04 * plot_limit_m, 1.04 * plot_limit_m)
 
 
@@ -333,7 +333,7 @@ def _describe_innovations(result: AxisComparison) -> str:
     return " ".join(sentences)
 
 
-def _format_fraction_outside(result: AxisComparison) -> str:
+def _format_fraction_outside_two_sigma(result: AxisComparison) -> str:
     fractions_text = ", ".join(
         f"{name} {consistency.fraction_outside_two_sigma:.1%}"
         for name, consistency in get_statistics_by_filter(result).items()
@@ -371,7 +371,11 @@ VELOCITY_PANEL = Panel(
     lambda _: "Velocity is not measured: each filter estimates it from positions and IMU.",
 )
 INNOVATIONS_PANEL = Panel(
-    "Innovations (m)", 140.0, draw_innovations, _format_fraction_outside, _describe_innovations
+    "Innovations (m)",
+    140.0,
+    draw_innovations,
+    _format_fraction_outside_two_sigma,
+    _describe_innovations,
 )
 POSITION_SIGMA_PANEL = Panel(
     "σ of position (m), log scale",

@@ -5,7 +5,7 @@ from importlib import metadata
 from typing import Any
 
 from px4fuse.core.memory import release_free_memory
-from px4fuse.core.text import one_line
+from px4fuse.core.text import shorten_to_line
 from px4fuse.report import (
     aids,
     clock,
@@ -84,10 +84,10 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
         {
             "title": title,
             "author": producer,
-            "head": one_line(
+            "head": shorten_to_line(
                 replace_unprintable(f"px4fuse · {source.name} · SHA-256 {source.sha256[:12]}"), 90
             ),
-            "student": one_line(replace_unprintable(student_text), 40),
+            "student": shorten_to_line(replace_unprintable(student_text), 40),
             "blocks": blocks,
             "results": results_json,
         }

@@ -11,13 +11,13 @@ from px4fuse.comparison.model import (
     FilterSummary,
     UntestedFilter,
 )
-from px4fuse.core.text import capitalise_first, format_factor, format_number
+from px4fuse.core.text import capitalise_first_letter, format_factor, format_number
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
 from px4fuse.filter.tuning import NoiseEstimate
 from px4fuse.finding import Finding, format_spans
 from px4fuse.findings.model import finding_title, split_cause_groups
-from px4fuse.flight.model import Alignment, ClockMap, Unavailable
+from px4fuse.flight.model import Alignment, ClockConversion, Unavailable
 from px4fuse.report.page import Cell, Page, styled_text
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 
@@ -128,7 +128,7 @@ def list_verdict_warnings(comparison: Comparison) -> list[str]:
     return notes
 
 
-def format_clock_map(clock: ClockMap) -> str:
+def format_clock_map(clock: ClockConversion) -> str:
     is_described_by_note = (
         clock.method in ("boot clock", "arrival time") or "own speed" in clock.note
     )
@@ -164,14 +164,14 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
 
 def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
     for finding, *effects in split_cause_groups(findings):
-        title = f"{capitalise_first(finding_title(finding.id))} [{finding.id}]"
+        title = f"{capitalise_first_letter(finding_title(finding.id))} [{finding.id}]"
         texts = [styled_text(title, bold=True), styled_text(finding.message)]
         if finding.remedy:
             texts.append(styled_text(f"Action: {finding.remedy}", colour=MUTED_COLOUR))
         if effects:
-            effect_titles = " ".join(f"{effect.title} [{effect.id}]." for effect in effects)
-            texts.append(styled_text(f"Consequences: {effect_titles}", colour=MUTED_COLOUR))
-        page.write_labelled(
+            consequences_text = " ".join(f"{effect.title} [{effect.id}]." for effect in effects)
+            texts.append(styled_text(f"Consequences: {consequences_text}", colour=MUTED_COLOUR))
+        page.write_labelled_text(
             f"{finding.severity}\n{format_spans(finding.spans_s)}".strip(),
             *texts,
             colour=SEVERITY_COLOURS[finding.severity],

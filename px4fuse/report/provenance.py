@@ -118,7 +118,7 @@ def _write_section(page: Page, title: str, texts: Iterable[str | tuple[str, str]
         if isinstance(text, str):
             page.write(text)
         else:
-            page.write_labelled(*text, label_width=LABEL_WIDTH)
+            page.write_labelled_text(*text, label_width=LABEL_WIDTH)
 
 
 def _write_methods(page: Page, name: str) -> None:

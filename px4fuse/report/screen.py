@@ -17,7 +17,7 @@ from px4fuse.request import ComparisonRequest, Request, command_line
 UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
 LABEL_CHARACTERS = 9  # width of a label
 MIN_TABLE_WIDTH = 50  # characters; narrower terminals show no tables
-POINTS_PER_COLUMN = 6.0  # points in the PDF per character on the terminal
+POINTS_PER_CHARACTER = 6.0  # points in the PDF per character on the terminal
 STYLES_BY_COLOUR = {
     MUTED_COLOUR: "dim",
     SEVERITY_COLOURS["error"]: "bold red",
@@ -36,7 +36,7 @@ def print_blocks(
     for block in blocks:
         match block["kind"]:
             case "text" | "heading":
-                indent = round(block.get("indent", 0.0) / POINTS_PER_COLUMN)
+                indent = round(block.get("indent", 0.0) / POINTS_PER_CHARACTER)
                 print_paragraph(console, _make_rich_text(block), Text(), indent=indent)
             case "labelled":
                 _show_labelled(console, block, request)

@@ -63,11 +63,11 @@ INNOVATION_STYLES = {
     "KF": dot_style(KF_COLOUR, "o", 2.0),
     "EKF2": dot_style(EKF2_COLOUR, "s", 2.2),
 }
-INNOVATION_SIGNS = {"KF": "●", "EKF2": "■"}  # in texts
+INNOVATION_SYMBOLS = {"KF": "●", "EKF2": "■"}  # in texts
 SIGMA_BAND_COLOURS = {"KF": KF_BAND_COLOUR, "EKF2": "#f0dccd"}
 FILTER_COLOURS = {name: TRACK_STYLES[label]["color"] for name, label in FILTER_NAMES.items()}
 # Rejected innovations of EKF2 are hollow
-REJECTED_STYLE = dot_style(EKF2_COLOUR, "s", 2.8, 0.6) | {"mfc": "white"}
+REJECTED_INNOVATION_STYLE = dot_style(EKF2_COLOUR, "s", 2.8, 0.6) | {"mfc": "white"}
 MEASUREMENT_STYLE = dot_style(MEASUREMENT_COLOUR, ".", 1.8)
 
 MAX_DRAWN_POINTS = 1000  # maximum per curve
@@ -128,9 +128,9 @@ def decimate_series(times: Array, values: Array) -> tuple[Array, Array]:
     if len(times) <= MAX_DRAWN_POINTS:
         return times, values
     bounds = np.linspace(0, len(times), MAX_DRAWN_POINTS // 2 + 1).astype(int)
-    starts, longest = bounds[:-1], int(np.diff(bounds).max())
+    starts, max_rows_per_interval = bounds[:-1], int(np.diff(bounds).max())
     # rows of each interval; shorter intervals repeat their last row
-    rows = np.minimum(starts[:, None] + np.arange(longest), bounds[1:, None] - 1)
+    rows = np.minimum(starts[:, None] + np.arange(max_rows_per_interval), bounds[1:, None] - 1)
     extremes = [starts + find(values[rows], axis=1) for find in (np.argmin, np.argmax)]
     selected_rows = np.unique(extremes)
     return times[selected_rows], values[selected_rows]

@@ -63,12 +63,12 @@ def make_comparison_page(
 def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
     source, segment = analysis.source, analysis.segment
     page.add("blank")
-    page.write_labelled(
+    page.write_labelled_text(
         "Position",
         f"{source.name}: {source.description}, {source.compute_rate_hz():.1f} Hz, "
         f"{source.frame}; {analysis.source_reason}",
     )
-    page.write_labelled(
+    page.write_labelled_text(
         "Segment", f"{segment.start_s:.2f} s to {segment.end_s:.2f} s, {segment.reason}"
     )
     write_error_table(page, analysis)
@@ -76,7 +76,7 @@ def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
         page.write_muted_text(note)
     explanation = analysis.difference_steps.get(analysis.main.axis.name)
     if isinstance(explanation, DifferenceExplanation):
-        page.write_labelled("KF-EKF2", explanation.sentences[0])
+        page.write_labelled_text("KF-EKF2", explanation.sentences[0])
     if aids := select_aids_of_outdoor_flight(analysis):
         write_aids(page, aids)
     write_findings(page, results.findings)

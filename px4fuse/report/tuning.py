@@ -6,7 +6,7 @@ import numpy as np
 
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.remedy import format_changes, make_height_noise_advice, make_noise_change
-from px4fuse.filter.signals import AISLE
+from px4fuse.filter.signals import AISLE_AXIS
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.findings.noises import KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION
 from px4fuse.flight.ekf2_parameters import EV_POS
@@ -21,7 +21,7 @@ def make_tuning_page(
     """Make a page on the estimates of SIGMA_A and SIGMA_Z along each axis."""
     page = Page()
     for name, tuning in tunings.items():
-        axis_name = name.replace(AISLE, "axis of largest motion")
+        axis_name = name.replace(AISLE_AXIS, "axis of largest motion")
         if isinstance(tuning, Unavailable):
             page.write_muted_text(f"No estimate, {axis_name}: {tuning.reason}. {tuning.remedy}")
             continue
@@ -39,14 +39,14 @@ def list_tuning_advice(
     comparison: PreparedComparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
 ) -> Iterator[tuple[str, str]]:
     """Yield advice from the noise estimates as pairs (label, text)."""
-    names = (HORIZONTAL, AISLE, *tuning_by_axis)
+    names = (HORIZONTAL, AISLE_AXIS, *tuning_by_axis)
     tunings = [
         tuning for name in names if isinstance(tuning := tuning_by_axis.get(name), AxisTuning)
     ]
     if not tunings:
         return
     tuning, origin, settings = tunings[0], comparison.source.origin, comparison.settings
-    axis_name = tuning.name.replace(AISLE, "axis of largest motion")
+    axis_name = tuning.name.replace(AISLE_AXIS, "axis of largest motion")
     sigma_a, sigma_z = tuning.sigma_a_two_state, tuning.sigma_z
     noises = (
         ("--sigma-a", sigma_a, settings.sigma_a_m_s2),
@@ -124,12 +124,12 @@ def _make_vision_noise_advice(comparison: PreparedComparison, estimate: NoiseEst
     variance_m2 = comparison.source.samples[Columns.POSITION_VARIANCE[:2]].median().mean()
     reported_sigma_m = 0.0 if np.isnan(variance_m2) else float(np.sqrt(variance_m2))
     changes = make_noise_change(EV_POS, parameters, reported_sigma_m, estimate.value)
-    logged_noise_m = parameters.get(name, np.nan)
+    noise_parameter_m = parameters.get(name, np.nan)
     # EKF2 used a too large σ of the messages: it must use its noise parameter instead
     if EV_POS.noise_mode_parameter in changes and reported_sigma_m > high_m:
         return (
             f"Set {format_changes(changes)}. The source reported a σ of {reported_sigma_m:.2g} m."
         )
-    if low_m <= logged_noise_m <= high_m:
-        return f"{name} {logged_noise_m:g} m is within the 95 % interval of the estimate."
-    return f"Set {name} to {changes[name]:g} m (now {logged_noise_m:g} m)."
+    if low_m <= noise_parameter_m <= high_m:
+        return f"{name} {noise_parameter_m:g} m is within the 95 % interval of the estimate."
+    return f"Set {name} to {changes[name]:g} m (now {noise_parameter_m:g} m)."

@@ -8,12 +8,12 @@ from px4fuse.core.text import format_number
 from px4fuse.ekf2.whatif import (
     ADDED_POSITION_SIGMA_M,
     HEIGHT_TIMEOUT_S,
-    MAX_REJECTED_FRACTION,
+    MAX_REJECTED_SAMPLE_FRACTION,
     AidStatistics,
     AxisStatistics,
     Ekf2Statistics,
 )
-from px4fuse.flight.ekf2_parameters import AIDS, PARAMETERS
+from px4fuse.flight.ekf2_parameters import AIDS, MODEL_PARAMETERS
 from px4fuse.flight.model import Unavailable
 from px4fuse.report.difference_page import format_replay_agreement
 from px4fuse.report.page import Page
@@ -24,7 +24,7 @@ NOT_PREDICTABLE_TEXT = "not predictable"
 def describe_changes(analysis: WhatIfAnalysis) -> str:
     """Describe the changed parameters and omitted aiding sources; "" without a change."""
     change_texts = [
-        f"{name} {format_number(value)} {PARAMETERS[name].unit}".rstrip()
+        f"{name} {format_number(value)} {MODEL_PARAMETERS[name].unit}".rstrip()
         for name, value in analysis.changes.items()
     ]
     change_texts += [
@@ -92,7 +92,7 @@ def list_sweep_results(analysis: WhatIfAnalysis) -> Iterator[str]:
     """Yield a line with EKF2 statistics for each value of a parameter."""
     for summary in select_sweep_summaries(analysis):
         name = find_swept_parameter(analysis)
-        value_text = f"{name} {format_number(summary.changed[name])} {PARAMETERS[name].unit}"
+        value_text = f"{name} {format_number(summary.changed[name])} {MODEL_PARAMETERS[name].unit}"
         text = NOT_PREDICTABLE_TEXT
         if summary.is_predictable:
             text = (
@@ -138,7 +138,8 @@ def describe_sweep(analysis: WhatIfAnalysis) -> list[str]:
     if not all(summary.is_predictable for summary in analysis.statistics.whatif):
         sentences.append(
             "'not predictable': the replay rejects more than "
-            f"{MAX_REJECTED_FRACTION:.0%} of the samples, {1000.0 * ADDED_POSITION_SIGMA_M:.0f} mm "
+            f"{MAX_REJECTED_SAMPLE_FRACTION:.0%} of the samples, "
+            f"{1000.0 * ADDED_POSITION_SIGMA_M:.0f} mm "
             "of added position noise changes the results strongly, or the replay fuses no height "
             f"for {HEIGHT_TIMEOUT_S:g} s."
         )
@@ -156,10 +157,10 @@ def make_whatif_page(analysis: WhatIfAnalysis) -> Page:
             "The logged noise and delay parameters fit this log best. "
             "Test another value with --set NAME=VALUE."
         )
-        page.write_labelled("Change", no_change_text)
+        page.write_labelled_text("Change", no_change_text)
     lines = (*list_statistics(analysis), *describe_sweep(analysis), *list_sweep_results(analysis))
     for line in lines:
         page.write(line)
-    page.write_labelled("Replay", format_replay_agreement(analysis.statistics.agreement))
+    page.write_labelled_text("Replay", format_replay_agreement(analysis.statistics.agreement))
     page.write("Replays use px4fuse's model of EKF2, not PX4's code.")
     return page

@@ -16,7 +16,7 @@ from msgspec import Meta
 
 from px4fuse.core.reading import read_text
 from px4fuse.core.record import Record, Sha256, read_csv, read_toml
-from px4fuse.core.text import one_line
+from px4fuse.core.text import shorten_to_line
 from px4fuse.errors import SettingsError
 
 # Maximum size (bytes) of an answer form
@@ -243,14 +243,14 @@ class FormQuestion(Record):
             "prediction": f"position sigma of KF (m) {number_text} s after update {update}, "
             "without further updates",
             "gate": f"numbers of all updates from {update} to "
-            f"{update + GATE_QUESTION_FURTHER_UPDATES} with an innovation outside ±{number_text} "
-            "sqrt(S), if KF has no gate",
+            f"{update + LATER_UPDATE_COUNT_IN_GATE_QUESTION} with an innovation outside "
+            f"±{number_text} sqrt(S), if KF has no gate",
         }[self.kind]
         return f"{quantity}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
 
 
 # A question about the innovation gate is about one update of KF and this number of later updates
-GATE_QUESTION_FURTHER_UPDATES = 20
+LATER_UPDATE_COUNT_IN_GATE_QUESTION = 20
 
 
 def select_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
@@ -308,7 +308,7 @@ def _describe_error(error: Exception, form_toml: str, form_values: dict[str, Any
     message = str(error)
     if line_match := re.search(r"\(at line (\d+), column \d+\)", message):
         line = line_match[1]
-        content = one_line(form_toml.splitlines()[int(line) - 1], 60)
+        content = shorten_to_line(form_toml.splitlines()[int(line) - 1], 60)
         return f"line {line} ({content}) is not valid; give {NUMBER_HELP}, or a word in quotes"
     reason, _, path = message.partition(" - at `$.")
     names = re.findall(r"\w+", path)
@@ -330,7 +330,7 @@ def _describe_error(error: Exception, form_toml: str, form_values: dict[str, Any
     accepted_values = ACCEPTED_ANSWER_BY_FIELD.get(names[0]) or ACCEPTED_ANSWER_BY_FIELD.get(
         names[-1], NUMBER_HELP
     )
-    return f"{label} is {one_line(str(invalid_value), 60)!r}; give {accepted_values}"
+    return f"{label} is {shorten_to_line(str(invalid_value), 60)!r}; give {accepted_values}"
 
 
 def _convert_form(form: dict[str, Any]) -> dict[str, Any]:

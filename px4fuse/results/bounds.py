@@ -3,7 +3,6 @@
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
@@ -27,19 +26,19 @@ CHECK_LOG_REMEDY = "Check the logged data."
 T = TypeVar("T", bound=msgspec.Struct)
 
 
-@dataclass(eq=False)
 class _OutOfBoundsError(Exception):
     """Number in results outside its valid range."""
 
-    path: str
-    reason: str
+    def __init__(self, path: str, reason: str) -> None:
+        super().__init__(reason)
+        self.path, self.reason = path, reason
 
 
-def find_bounds(name: str) -> tuple[float, float]:
+def find_field_bounds(name: str) -> tuple[float, float]:
     """Return the smallest and the largest valid value of a field in the results.
 
-    >>> find_bounds("nis_mean"), find_bounds("position_rmse_m"), find_bounds("start_s")
-    ((0.0, 1000000.0), (-1000000000.0, 1000000000.0), (-inf, inf))
+    >>> find_field_bounds("nis_mean"), find_field_bounds("start_s")
+    ((0.0, 1000000.0), (-inf, inf))
     """
     matching_bounds = (
         bounds for pattern, bounds in RANGE_BY_FIELD_PATTERN.items() if re.search(pattern, name)
@@ -59,7 +58,7 @@ def drop_invalid_numbers(results: T) -> T:
     """
     errors: list[_OutOfBoundsError] = []
     try:
-        checked_results: T = _check_value(results, None, "", errors)
+        checked_results: T = _drop_invalid_values(results, None, "", errors)
     except _OutOfBoundsError as error:
         raise ResultsError(
             f"a required result is not valid: {error.reason}", CHECK_LOG_REMEDY
@@ -93,24 +92,28 @@ def find_value_type(annotation: Any) -> Any:
     return Any
 
 
-def _check_value(value: Any, annotation: Any, path: str, errors: list[_OutOfBoundsError]) -> Any:
+def _drop_invalid_values(
+    value: Any, annotation: Any, path: str, errors: list[_OutOfBoundsError]
+) -> Any:
     """Return the value without invalid numbers, or an Unavailable if ``annotation`` allows it."""
     try:
         if isinstance(value, msgspec.Struct):
-            return _check_struct(value, path, errors)
+            return _drop_invalid_fields(value, path, errors)
         if isinstance(value, Mapping):
-            return _check_mapping(value, annotation, path, errors)
+            return _drop_invalid_entries(value, annotation, path, errors)
         if isinstance(value, tuple):
-            return _check_tuple(value, path, errors)
+            return _drop_invalid_elements(value, path, errors)
         if isinstance(value, float):
             _require_valid_number(value, path)
     except _OutOfBoundsError as error:
         for unavailable_type in list_types(annotation):
             if isinstance(unavailable_type, type) and issubclass(unavailable_type, Unavailable):
                 text_fields = {"what": path, "reason": error.reason, "remedy": CHECK_LOG_REMEDY}
-                # for example the truth errors of a filter, if its NIS is not valid
+                # for example the errors of a filter against ground truth, if its NIS is not valid
                 other_fields = {
-                    field.name: _check_value(getattr(value, field.name), field.type, path, errors)
+                    field.name: _drop_invalid_values(
+                        getattr(value, field.name), field.type, path, errors
+                    )
                     for field in fields(unavailable_type)
                     if field.name not in text_fields and hasattr(value, field.name)
                 }
@@ -120,14 +123,14 @@ def _check_value(value: Any, annotation: Any, path: str, errors: list[_OutOfBoun
 
 
 def _require_valid_number(value: float, path: str) -> None:
-    low, high = find_bounds(path.rpartition(".")[2])
+    low, high = find_field_bounds(path.rpartition(".")[2])
     if not math.isfinite(value):
         raise _OutOfBoundsError(path, f"{path} has a value that is not finite")
     if not low <= value <= high:
         raise _OutOfBoundsError(path, f"{path} is {value:.3g} (allowed: {low:g} to {high:g})")
 
 
-def _check_struct(
+def _drop_invalid_fields(
     value: msgspec.Struct, path: str, errors: list[_OutOfBoundsError]
 ) -> msgspec.Struct:
     changes: dict[str, Any] = {}
@@ -136,7 +139,7 @@ def _check_struct(
             continue
         field_value, field_path = getattr(value, field.name), f"{path}.{field.name}".lstrip(".")
         try:
-            changes[field.name] = _check_value(field_value, field.type, field_path, errors)
+            changes[field.name] = _drop_invalid_values(field_value, field.type, field_path, errors)
         except _OutOfBoundsError as error:
             if field.default is not None:
                 raise
@@ -145,13 +148,13 @@ def _check_struct(
     return type(value)(**changes)
 
 
-def _check_mapping(
+def _drop_invalid_entries(
     value: Mapping[str, Any], annotation: Any, path: str, errors: list[_OutOfBoundsError]
 ) -> Any:
     checked_elements: dict[str, Any] = {}
     for key, element in value.items():
         try:
-            checked_elements[key] = _check_value(
+            checked_elements[key] = _drop_invalid_values(
                 element, find_value_type(annotation), f"{path}.{key}", errors
             )
         except _OutOfBoundsError as error:
@@ -164,7 +167,7 @@ def _check_mapping(
     return checked_elements
 
 
-def _check_tuple(
+def _drop_invalid_elements(
     value: tuple[Any, ...], path: str, errors: list[_OutOfBoundsError]
 ) -> tuple[Any, ...]:
     """Return the valid elements of a tuple.
@@ -175,7 +178,7 @@ def _check_tuple(
     checked_elements = []
     for element in value:
         try:
-            checked_elements.append(_check_value(element, Any, path, errors))
+            checked_elements.append(_drop_invalid_values(element, Any, path, errors))
         except _OutOfBoundsError as error:
             if not isinstance(element, msgspec.Struct):
                 raise

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from px4fuse.card.model import Card
+from px4fuse.card.model import DiagnosisCard
 from px4fuse.comparison.model import AxisComparison, FilterName
 from px4fuse.comparison.rerun_effects import Rerun
 from px4fuse.convention.model import Convention
@@ -26,7 +26,7 @@ from px4fuse.core.record import (
 )
 from px4fuse.core.text import convert_nested
 from px4fuse.ekf2.aids import AidResult
-from px4fuse.ekf2.replay import Agreement, Ekf2Replay
+from px4fuse.ekf2.replay import Ekf2Replay, ReplayAgreement
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2.whatif import Ekf2Statistics
 from px4fuse.filter.consistency import HorizontalNis
@@ -36,7 +36,7 @@ from px4fuse.filter.tuning import AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.flight.model import (
     Alignment,
-    ClockMap,
+    ClockConversion,
     InputFile,
     LogInfo,
     PositionKind,
@@ -47,7 +47,7 @@ from px4fuse.request import AxisName, ComparisonRequest, KfInputName, LoopReques
 from px4fuse.results.model import SCHEMA_VERSION, Provenance, Schema, Student, Version
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.solver import Graph
-from px4fuse.trajectory.model import Track
+from px4fuse.trajectory.model import TrajectorySummary
 
 # Maximum number of significant digits of a number in the results
 SIGNIFICANT_DIGITS = 10
@@ -57,7 +57,7 @@ class Log(LogInfo, kw_only=True):
     """Log, additional input files (``joined``), and clocks converted to boot time."""
 
     joined: tuple[InputFile, ...]
-    clocks: tuple[ClockMap, ...]
+    clocks: tuple[ClockConversion, ...]
 
 
 class AvailableTrack(Record):
@@ -204,7 +204,7 @@ class ComparisonResults(_FlightResults):
         Re-runs of KF that explain the difference KF - EKF2.
     trials : tuple of Rerun
         Re-runs of KF and EKF2, each with one change of a setting or of the data.
-    card : Card
+    card : DiagnosisCard
         Summary of the diagnosis.
     convention : Convention
         Detected axes, unit, clock and orientation of the positions.
@@ -220,7 +220,7 @@ class ComparisonResults(_FlightResults):
     trials: tuple[Rerun, ...]
     aids: dict[str, AidResult]
     loop: OrUnavailable[Loop]
-    card: Card
+    card: DiagnosisCard
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
     missing: tuple[Unavailable, ...]
@@ -236,7 +236,7 @@ class AidsResults(Record):
     request: ComparisonRequest
     log: Log
     aids: Annotated[dict[str, AidResult], Meta(min_length=1)]
-    card: Card
+    card: DiagnosisCard
     findings: tuple[Finding, ...]
     missing: tuple[Unavailable, ...]
     student: Student
@@ -262,8 +262,8 @@ class LoopResults(Record):
 
     schema: Schema
     request: LoopRequest
-    track: Track
-    references: tuple[Track, ...]
+    track: TrajectorySummary
+    references: tuple[TrajectorySummary, ...]
     loop: Loop
     findings: tuple[Finding, ...]
     student: Student
@@ -282,8 +282,8 @@ class EvaluationResults(Evaluation, kw_only=True):
     """Results of ``px4fuse evaluate``: errors of a trajectory against a reference trajectory."""
 
     schema: Schema
-    estimate: Track
-    reference: Track
+    estimate: TrajectorySummary
+    reference: TrajectorySummary
     provenance: Provenance
 
 
@@ -292,7 +292,7 @@ class WhatIfResults(Record, kw_only=True, rename={"uses_estimates": "asked"}):
 
     Attributes
     ----------
-    agreement : Agreement
+    agreement : ReplayAgreement
         Agreement of the EKF2 replay with the logged EKF2.
     evaluated_s : tuple of (float, float)
         Time spans (s) of all statistics.
@@ -307,7 +307,7 @@ class WhatIfResults(Record, kw_only=True, rename={"uses_estimates": "asked"}):
     schema: Schema
     request: WhatIfRequest
     log: Log
-    agreement: Agreement
+    agreement: ReplayAgreement
     evaluated_s: tuple[Span, ...]
     uses_estimates: bool
     logged: Ekf2Statistics
@@ -318,7 +318,7 @@ class WhatIfResults(Record, kw_only=True, rename={"uses_estimates": "asked"}):
     provenance: Provenance
 
 
-class ChangeResults(Record, kw_only=True):
+class DiffResults(Record, kw_only=True):
     """Results of ``px4fuse diff``: differences between the inputs A and B.
 
     ``worse`` contains a sentence for each filter that is consistent only in A, and each new error.
@@ -343,7 +343,7 @@ Results = (
     | GraphResults
     | EvaluationResults
     | WhatIfResults
-    | ChangeResults
+    | DiffResults
 )
 # Type of the results, by name of the JSON schema
 RESULTS_BY_SCHEMA: dict[str, type[Results]] = {
@@ -355,7 +355,7 @@ RESULTS_BY_SCHEMA: dict[str, type[Results]] = {
     "px4fuse-graph": GraphResults,
     "px4fuse-evaluation": EvaluationResults,
     "px4fuse-whatif": WhatIfResults,
-    "px4fuse-changes": ChangeResults,
+    "px4fuse-changes": DiffResults,
 }
 
 

@@ -8,7 +8,7 @@ import msgspec
 from msgspec.structs import fields
 
 from px4fuse.core.record import decode_record_or_unavailable
-from px4fuse.core.text import clean_text, convert_nested, one_line
+from px4fuse.core.text import clean_text, convert_nested, shorten_to_line
 from px4fuse.errors import ResultsError
 from px4fuse.results.bounds import find_value_type, list_types
 from px4fuse.results.contract import RESULTS_BY_SCHEMA, Results
@@ -36,7 +36,7 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     except RecursionError as error:
         raise ResultsError(f"{name} is nested too deeply.") from error
     except (msgspec.DecodeError, ValueError) as error:
-        raise ResultsError(f"{name} is not JSON ({one_line(str(error), 100)}).") from error
+        raise ResultsError(f"{name} is not JSON ({shorten_to_line(str(error), 100)}).") from error
     try:
         schema = decoded_results["schema"]
         results_type, version = RESULTS_BY_SCHEMA[schema["name"]], str(schema["version"])
@@ -47,9 +47,10 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
         version_text = "the version that wrote the results"
         provenance = decoded_results.get("provenance")
         if isinstance(provenance, dict) and "px4fuse" in provenance:
-            version_text = f"px4fuse {one_line(str(provenance['px4fuse']), 60)}"
+            version_text = f"px4fuse {shorten_to_line(str(provenance['px4fuse']), 60)}"
         raise ResultsError(
-            f"{name} uses schema version {one_line(version, 20)}; px4fuse reads version {major}.",
+            f"{name} uses schema version {shorten_to_line(version, 20)}; px4fuse reads version "
+            f"{major}.",
             f"Create the report again, or read it with {version_text}.",
         )
     if int(version.partition(".")[2]) > int(minor):
@@ -60,7 +61,7 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
         )
     except msgspec.ValidationError as error:
         raise ResultsError(
-            f"{name} does not follow the results schema: {one_line(str(error), 300)}."
+            f"{name} does not follow the results schema: {shorten_to_line(str(error), 300)}."
         ) from error
     return results
 

@@ -15,11 +15,11 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray, cumulative_sums
+from px4fuse.ekf2.filter_batch import FilterConfiguration
 from px4fuse.ekf2.filter_recursion import (
     HEADING,
     HORIZONTAL_POSITION,
     HORIZONTAL_POSITION_COLUMNS,
-    FilterConfiguration,
     SegmentRun,
 )
 from px4fuse.ekf2.inputs import GNSS_RULES, VISION_RULES, ReceivedPositions, ReplayInputs
@@ -38,7 +38,7 @@ from px4fuse.ekf2.replay_segments import (
     VELOCITY,
     HeightSamples,
     ReplaySegment,
-    add_field_states,
+    add_magnetic_field_states,
     downsample_imu,
     find_sample_steps,
     find_step_ends,
@@ -50,7 +50,7 @@ from px4fuse.flight.ekf2_parameters import (
     GNSS_VEL,
     MAG,
     Aid,
-    fill_with_defaults,
+    fill_parameters_with_defaults,
 )
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ekf2_topics import (
@@ -109,7 +109,7 @@ def _select_fused_aids(scenario: Scenario) -> tuple[Aid, ...]:
 def make_parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | float]:
     """Return the values of all PX4 parameters that the log contains, by PX4 name."""
     aid = scenario.aid
-    defaults = fill_with_defaults({}, *_select_fused_aids(scenario))
+    defaults = fill_parameters_with_defaults({}, *_select_fused_aids(scenario))
     delay_ms = defaults[aid.delay] if faults.ekf2_delay_s is None else 1e3 * faults.ekf2_delay_s
     aid_parameters: dict[str, float] = {aid.noise_mode_parameter: 1}
     if aid == GNSS_POS:
@@ -164,7 +164,7 @@ def simulate_ekf2(
         )
         segment = _add_barometer(segment, barometer, barometer_times_s)
         if not logged_values[MAG.switch]:  # EKF2 fuses all axes of the magnetic field
-            segment = add_field_states(
+            segment = add_magnetic_field_states(
                 segment,
                 magnetometer_times_s,
                 magnetometer.fields["magnetometer_ga"].astype(np.float64),
@@ -173,7 +173,7 @@ def simulate_ekf2(
                 np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)]),
                 np.full(6, MAGNETIC_FIELD_SIGMA_GAUSS**2),
             )
-    settings = fill_with_defaults(logged_values, *_select_fused_aids(scenario))
+    settings = fill_parameters_with_defaults(logged_values, *_select_fused_aids(scenario))
     rules = GNSS_RULES if aid == GNSS_POS else VISION_RULES
     if not int(log_parameters[aid.switch]) & 1:
         # If bit 0 of EKF2_EV_CTRL is not set, EKF2 tests the positions but never fuses them
@@ -184,7 +184,7 @@ def simulate_ekf2(
     inputs = ReplayInputs(
         settings=settings,
         segments=(segment,),
-        received_positions=_select_positions(source),
+        received_positions=_select_accepted_positions(source),
         rules=rules,
         mean_step_s=step_s,
         horizon_s=(buffer_length - 1) * step_s,
@@ -244,7 +244,7 @@ def _make_segment(
     attitude_error_rad = sensors.simulate_attitude_error(scenario, faults, time_s).as_rotvec()
     attitude_error_rad[:, :HEADING] = 0.0  # EKF2 estimates the tilt itself
     # measured at time 0, where the vehicle still stands
-    specific_force_m_s2, rate_rad_s = sensors.measure_imu(
+    specific_force_m_s2, rate_rad_s = sensors.simulate_imu_samples(
         scenario,
         faults,
         motion,
@@ -306,7 +306,7 @@ def _compute_state_at_rest(
     return x, 0.5 * (P + P.T)
 
 
-def _select_positions(source: sensors.SimulatedPositions) -> ReceivedPositions:
+def _select_accepted_positions(source: sensors.SimulatedPositions) -> ReceivedPositions:
     """List the positions that EKF2 accepts, in order of arrival.
 
     EKF2 ignores positions that are older than the previous one (estimator_interface.cpp).
@@ -352,10 +352,10 @@ def _compute_output(inputs: ReplayInputs, model_run: SegmentRun) -> Ekf2Output:
     # Attitude error (NED) of the output predictor, which integrates the newest gyro samples. It
     # subtracts the older gyro bias of the fusion horizon
     gyro_bias_rad_s = rotate(segment.body_to_ned[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:])
-    attitude_error_steps_rad = (
+    attitude_error_increments_rad = (
         -segment.attitude_correction_rad - gyro_bias_rad_s * segment.step_s[:, None]
     )
-    gyro_attitude_error_rad = state[0, THETA] + cumulative_sums(attitude_error_steps_rad)
+    gyro_attitude_error_rad = state[0, THETA] + cumulative_sums(attitude_error_increments_rad)
     # the output predictor then follows the attitude of the fusion horizon, lag_steps later
     attitude_error_rad = gyro_attitude_error_rad + sum_attitude_corrections(
         state[:, THETA] - gyro_attitude_error_rad, lag_steps, inputs.mean_step_s, inputs.horizon_s

@@ -82,17 +82,17 @@ class Sines:
         amplitude = rms_by_axis * np.sqrt(2.0 / SLOW_ERROR_SINE_COUNT)
         return cls(angular_frequency, amplitude * np.cos(phase), amplitude * np.sin(phase))
 
-    def compute_values(self, time_s: Array, output_count: int = 1) -> list[Array]:
-        """Return the sum of the sines and its time derivatives: ``output_count`` arrays (t, k)."""
+    def compute_values(self, time_s: Array, array_count: int = 1) -> list[Array]:
+        """Return the sum of the sines and its time derivatives: ``array_count`` arrays (t, k)."""
         angle = np.outer(time_s, self.angular_frequency_rad_s)
         basis = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
         amplitudes = [np.concatenate([self.sine, self.cosine])]
         omega = self.angular_frequency_rad_s[:, None]
-        for _ in range(output_count - 1):
+        for _ in range(array_count - 1):
             # d/dt (s sin ωt + c cos ωt) = -ωc sin ωt + ωs cos ωt
             sine, cosine = np.split(amplitudes[-1], 2)
             amplitudes.append(np.concatenate([-omega * cosine, omega * sine]))
-        return np.split(basis @ np.hstack(amplitudes), output_count, axis=1)
+        return np.split(basis @ np.hstack(amplitudes), array_count, axis=1)
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class Motion:
 
     def compute_body_to_ned(self, time_s: Array) -> Array:
         """Return the true attitude, shape (n, 3, 3); the columns are the body axes, FRD."""
-        return compute_attitude(self.compute_true_state(time_s)).body_to_ned
+        return compute_attitude_and_imu(self.compute_true_state(time_s)).body_to_ned
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ class AttitudeAndImu:
     specific_force_m_s2: Array
 
 
-def compute_attitude(state: TrueState) -> AttitudeAndImu:
+def compute_attitude_and_imu(state: TrueState) -> AttitudeAndImu:
     """Return attitude, angular rate and specific force of a quadrotor in the true motion."""
     gravity = np.array([0.0, 0.0, constants.g])
     negative_thrust_acceleration_m_s2 = gravity - state.acceleration_m_s2
@@ -299,12 +299,12 @@ def _plan_aisle_passes(flight_plan: _FlightBuilder, scenario: Scenario, speed_m_
         flight_plan.add_velocity_change(
             pass_velocity_m_s, SPEED_RAMP_DURATION_S, scenario.length_m / scenario.speed_m_s
         )
-        stop_s = flight_plan.ramp_centre_s + SPEED_RAMP_DURATION_S / 2.0
+        stop_time_s = flight_plan.ramp_centre_s + SPEED_RAMP_DURATION_S / 2.0
         flight_plan.add_velocity_change(
             -pass_velocity_m_s, SPEED_RAMP_DURATION_S, SPEED_RAMP_DURATION_S + pause_s
         )
         if heading_follows_path and pass_index < scenario.passes - 1:
-            flight_plan.yaw_ramps.append((stop_s, TURN_ROUND_DURATION_S, np.array([np.pi])))
+            flight_plan.yaw_ramps.append((stop_time_s, TURN_ROUND_DURATION_S, np.array([np.pi])))
 
 
 def _plan_square_laps(

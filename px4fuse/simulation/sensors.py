@@ -12,11 +12,11 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray, integrate_cumulatively
-from px4fuse.flight.ekf2_parameters import GNSS_POS, PARAMETERS
+from px4fuse.flight.ekf2_parameters import GNSS_POS, MODEL_PARAMETERS
 from px4fuse.readers.px4_positions import unproject
-from px4fuse.readers.px4_topics import GPS_POSITION
+from px4fuse.readers.px4_topics import GPS_POSITION_TOPIC
 from px4fuse.simulation.faults import FaultSizes
-from px4fuse.simulation.motion import Motion, Sines, compute_attitude, compute_direction
+from px4fuse.simulation.motion import Motion, Sines, compute_attitude_and_imu, compute_direction
 from px4fuse.simulation.scenario import DT_S, Scenario
 from px4fuse.simulation.ulog_writer import Topic, make_topic
 
@@ -40,7 +40,7 @@ MEAN_OUTLIER_BURST_POSITION_COUNT = 3
 # Origin of the local frame outdoors: latitude, longitude (degrees) and altitude (m)
 HOME_POSITION = (47.397742, 8.545594, 488.0)
 # Time (s) from the measurement of a GNSS position to its timestamp
-GNSS_DELAY_S = 1e-3 * PARAMETERS[GNSS_POS.delay].default
+GNSS_DELAY_S = 1e-3 * MODEL_PARAMETERS[GNSS_POS.delay].default
 # GNSS noise north, east and down, as multiples of the σ of the scenario
 GNSS_SIGMA_FACTORS = np.array([1.0, 1.0, 1.5])
 # Magnetic field (gauss, NED) at HOME_POSITION
@@ -117,7 +117,7 @@ def draw_imu_biases(scenario: Scenario, faults: FaultSizes) -> tuple[Array, Arra
 def simulate_imu(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
     """Simulate sensor_combined (accelerometer and gyro) at the full rate, without gaps."""
     time_us = _make_sample_times_us(motion, scenario.imu_rate_hz)
-    specific_force_m_s2, rate_rad_s = measure_imu(
+    specific_force_m_s2, rate_rad_s = simulate_imu_samples(
         scenario, faults, motion, to_seconds(time_us), RandomStream.IMU_NOISE
     )
     vibration_sigma_m_s2 = faults.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
@@ -126,7 +126,7 @@ def simulate_imu(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topi
     ).standard_normal(specific_force_m_s2.shape)
     interval_us = round(1e6 / scenario.imu_rate_hz)
     sample_fields: dict[str, Any] = {
-        "timestamp": _to_boot_time(time_us),
+        "timestamp": _to_boot_time_us(time_us),
         "gyro_rad": rate_rad_s,
         "gyro_integral_dt": interval_us,
         "accelerometer_m_s2": specific_force_m_s2,
@@ -198,7 +198,7 @@ def get_time_us(topic: Topic, field: str = "timestamp") -> IntArray:
     return topic.fields[field].astype(np.int64) - FIRST_TIMESTAMP_US
 
 
-def measure_imu(
+def simulate_imu_samples(
     scenario: Scenario,
     faults: FaultSizes,
     motion: Motion,
@@ -210,7 +210,7 @@ def measure_imu(
 
     The noise is that of a mean over ``samples_per_average`` samples.
     """
-    truth = compute_attitude(motion.compute_true_state(time_s))
+    truth = compute_attitude_and_imu(motion.compute_true_state(time_s))
     rng = make_random_generator(scenario, random_stream)
     accelerometer_bias_m_s2, gyro_bias_rad_s = draw_imu_biases(scenario, faults)
 
@@ -253,9 +253,11 @@ def make_attitude_topic(name: str, time_us: IntArray, delay_us: int, quaternion:
 def simulate_attitude_error(scenario: Scenario, faults: FaultSizes, time_s: Array) -> Rotation:
     """Simulate the error of the logged attitude, a rotation in NED."""
     tilt_rms_deg = scenario.tilt_error_deg
-    rms_rad = np.radians([tilt_rms_deg, tilt_rms_deg, scenario.yaw_error_deg])
+    rms_attitude_error_rad = np.radians([tilt_rms_deg, tilt_rms_deg, scenario.yaw_error_deg])
     rng = make_random_generator(scenario, RandomStream.ATTITUDE_ERROR)
-    error_rad = Sines.draw(rng, rms_rad, SLOW_ERROR_PERIOD_RANGE_S).compute_values(time_s)[0]
+    error_rad = Sines.draw(rng, rms_attitude_error_rad, SLOW_ERROR_PERIOD_RANGE_S).compute_values(
+        time_s
+    )[0]
     heading_error_rad = np.radians(faults.heading_deg)
     if faults.heading_at_s is not None:
         heading_error_rad *= -np.expm1(
@@ -275,7 +277,7 @@ def simulate_land_detector(motion: Motion) -> Topic:
     is_landed = (time_us < take_off_us) | (time_us >= touch_down_us)
     landed_flags = dict.fromkeys(("ground_contact", "maybe_landed", "landed"), is_landed)
     return make_topic(
-        "vehicle_land_detected", {"timestamp": _to_boot_time(time_us), **landed_flags}
+        "vehicle_land_detected", {"timestamp": _to_boot_time_us(time_us), **landed_flags}
     )
 
 
@@ -342,14 +344,14 @@ def simulate_positions(
             "altitude_msl_m": HOME_POSITION[2] - down_m,
         }
         fields |= {f"vel_{axis}_m_s": velocity_m_s[:, i] for i, axis in enumerate("ned")}
-        topic = make_topic(GPS_POSITION, fields)
+        topic = make_topic(GPS_POSITION_TOPIC, fields)
     else:
         fields = make_timestamps(timestamp_us, arrival_times_us - timestamp_us) | {
             "position": position_m,
             "position_variance": np.full(position_m.shape, reported_sigma_m**2),
         }
         if is_loop:
-            fields["q"] = to_quaternions(compute_attitude(state).body_to_ned[is_logged])
+            fields["q"] = to_quaternions(compute_attitude_and_imu(state).body_to_ned[is_logged])
         topic = make_topic("vehicle_visual_odometry", fields)
     return SimulatedPositions(
         topic=topic,
@@ -492,8 +494,8 @@ def to_seconds(time_us: IntArray) -> Array:
 def make_timestamps(time_us: IntArray, delay_us: int | IntArray = 0) -> dict[str, Any]:
     """Return ``timestamp_sample``, and ``timestamp`` (``delay_us`` later)."""
     return {
-        "timestamp": _to_boot_time(time_us + delay_us),
-        "timestamp_sample": _to_boot_time(time_us),
+        "timestamp": _to_boot_time_us(time_us + delay_us),
+        "timestamp_sample": _to_boot_time_us(time_us),
     }
 
 
@@ -506,5 +508,5 @@ def split_vectors(values: Mapping[str, Array]) -> dict[str, Any]:
     }
 
 
-def _to_boot_time(time_us: IntArray) -> NDArray[np.uint64]:
+def _to_boot_time_us(time_us: IntArray) -> NDArray[np.uint64]:
     return (FIRST_TIMESTAMP_US + time_us).astype(np.uint64)

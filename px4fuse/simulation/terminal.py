@@ -19,29 +19,29 @@ def summary(simulation: Simulation, answer: Path | None) -> Page:
     """Format the simulated flight with its injected faults."""
     scenario, page = simulation.scenario, Page()
     path, source = PATH_AND_SOURCE_BY_KIND[scenario.kind]
-    page.write_labelled(
+    page.write_labelled_text(
         "Flight",
         f"{scenario.kind}, {path} of {scenario.length_m:g} m, "
         f"{format_count(scenario.passes, 'time')} at {scenario.speed_m_s:g} m/s, "
         f"{simulation.motion.duration_s:g} s, seed {scenario.seed}",
     )
-    page.write_labelled(
+    page.write_labelled_text(
         "Position", f"{source}, {scenario.source_sigma_m:g} m at {scenario.source_rate_hz:g} Hz"
     )
     if scenario.kind == "loop":
-        page.write_labelled("VIO drift", f"{scenario.vio_drift:.1%} of the distance flown")
-    page.write_labelled(
+        page.write_labelled_text("VIO drift", f"{scenario.vio_drift:.1%} of the distance flown")
+    page.write_labelled_text(
         "IMU", f"{scenario.imu_rate_hz:g} Hz, SIGMA_A {scenario.sigma_a_m_s2:g} m/s²"
     )
     fault_texts = [
         f"{format_fault(name, simulation.faults)}: {FAULT_TYPES[name].help}"
         for name in injected_fault_names(simulation.faults)
     ]
-    page.write_labelled("Faults", *(fault_texts or ["none"]))
-    page.write_labelled("Truth", "logged" if scenario.truth else "not logged")
-    page.write_labelled(
+    page.write_labelled_text("Faults", *(fault_texts or ["none"]))
+    page.write_labelled_text("Truth", "logged" if scenario.truth else "not logged")
+    page.write_labelled_text(
         "EKF2", "from px4fuse's model of EKF2" if scenario.ekf2 else "not simulated (--no-ekf2)"
     )
     if answer is not None:
-        page.write_labelled("Answer", f"{to_one_line(str(answer))} (not for students)")
+        page.write_labelled_text("Answer", f"{to_one_line(str(answer))} (not for students)")
     return page

@@ -18,7 +18,7 @@ AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 # Minimum extent of a path along its second principal axis, divided by the largest extent
 MIN_EXTENT_RATIO_FOR_ROTATION = 1e-6
 # Minimum extent (m, RMS) of a path
-MIN_EXTENT_M = 1e-6
+MIN_PATH_EXTENT_M = 1e-6
 # Maximum residual (RMS) after a yaw alignment, divided by the horizontal motion (RMS)
 MAX_RESIDUAL_TO_MOTION_RATIO_FOR_YAW = 1.0
 # Maximum residual (RMS) after a rotation alignment, divided by the motion (RMS) perpendicular to
@@ -92,16 +92,17 @@ def fit_alignment(
         )
     if kind == "none":
         return Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0)
-    # Fit the scale even for SE(3): a scale factor error would increase the residuals in the
-    # following test of sufficient motion
-    transform = umeyama(estimate_m, reference_m, with_scale=True)
     if kind == "yaw":
         estimate_xy_m, reference_xy_m = (m[:, 0] + 1j * m[:, 1] for m in (estimate_m, reference_m))
         centred_estimate_m = estimate_xy_m - estimate_xy_m.mean()
         yaw_rad = np.angle(np.vdot(centred_estimate_m, reference_xy_m - reference_xy_m.mean()))
         transform = _make_transform(
-            Rotation.from_euler("z", yaw_rad), estimate_m, reference_m, 1.0, 4
+            Rotation.from_euler("z", yaw_rad), estimate_m, reference_m, 1.0, degrees_of_freedom=4
         )
+    else:
+        # Fit the scale even for SE(3): a scale factor error would increase the residuals in the
+        # following test of sufficient motion
+        transform = umeyama(estimate_m, reference_m, with_scale=True)
     if requires_motion:
         _require_sufficient_motion(transform, estimate_m, reference_m, kind)
     return umeyama(estimate_m, reference_m, with_scale=False) if kind == "se3" else transform
@@ -122,7 +123,7 @@ def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Trans
     s = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])  # Umeyama eq. 43
     estimate_variance_m2 = float((x * x).sum() / len(x))  # Umeyama eq. 36
     scale = 1.0
-    if with_scale and estimate_variance_m2 > MIN_EXTENT_M**2:  # avoid an infinite scale
+    if with_scale and estimate_variance_m2 > MIN_PATH_EXTENT_M**2:  # avoid an infinite scale
         scale = float(d @ s / estimate_variance_m2)  # Umeyama eq. 42
     rotation = Rotation.from_matrix((u * s) @ vt)  # Umeyama eq. 40
     return _make_transform(rotation, estimate_m, reference_m, scale, 7 if with_scale else 6)
@@ -155,6 +156,7 @@ def _require_sufficient_motion(
     reference_extents_m = _compute_principal_extents_m(reference_m)
     residuals_m = reference_m - transform.apply(estimate_m)
     if kind == "yaw":
+        # Horizontal motion determines yaw: compare with the whole motion
         extent_m = min(
             float(np.linalg.norm(position_m[:, :2].std(axis=0)))
             for position_m in (estimate_m, reference_m)
@@ -165,7 +167,8 @@ def _require_sufficient_motion(
         motion_text = "horizontal motion"
         remedy = "Set `alignment` to none to compare the trajectories without alignment."
     else:
-        # motion along a line does not determine the rotation around the line
+        # Motion along a line does not determine the rotation around the line: the extent along the
+        # second principal direction is decisive, and the smaller one of both trajectories
         max_extent_m, extent_m, _ = np.minimum(
             transform.scale * _compute_principal_extents_m(estimate_m), reference_extents_m
         )
@@ -174,7 +177,7 @@ def _require_sufficient_motion(
         remedy = "Set `alignment` to yaw or none."
     residual_m = compute_rms_length_m(residuals_m)
     if (
-        extent_m < max(MIN_EXTENT_M, MIN_EXTENT_RATIO_FOR_ROTATION * max_extent_m)
+        extent_m < max(MIN_PATH_EXTENT_M, MIN_EXTENT_RATIO_FOR_ROTATION * max_extent_m)
         or residual_m > max_residual_ratio * extent_m
     ):
         raise TrajectoryError(

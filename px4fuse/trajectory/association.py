@@ -13,14 +13,14 @@ from px4fuse.core.arrays import (
     compute_median_interval_s,
     interpolate_columns,
 )
-from px4fuse.core.record import Count, NotNegative, Record
+from px4fuse.core.record import Count, NonNegativeFloat, Record
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
 AssociationMethod = Literal["interpolate", "nearest"]
 
 # Default maximum gap in the reference for interpolation, in median pose intervals
-MAX_GAP_INTERVALS = 3.0
+MAX_GAP_IN_MEDIAN_INTERVALS = 3.0
 # A reference with a longer mean pose interval (s) is not interpolated
 MIN_SPARSE_POSE_INTERVAL_S = 2.0
 # Lower limit (s) of the default maximum gap for interpolation
@@ -46,7 +46,7 @@ class Association(Record):
 
     method: AssociationMethod
     poses: Count
-    max_gap_s: NotNegative
+    max_gap_s: NonNegativeFloat
     outside: Count
     in_gaps: Count
     coverage_estimate: float
@@ -77,25 +77,27 @@ def associate(
     TrajectoryError
         Fewer than three poses match.
     """
-    # The path between two poses of a sparse reference is unknown
     estimate_interval_s = compute_median_interval_s(estimate.time_s)
-    if method == "interpolate" and max_gap_s is None:
-        reference_interval_s = compute_median_interval_s(reference.time_s)
-        if reference_interval_s > max(MIN_SPARSE_POSE_INTERVAL_S, 2.0 * estimate_interval_s):
+    if max_gap_s is None:
+        max_interpolated_interval_s = max(MIN_SPARSE_POSE_INTERVAL_S, 2.0 * estimate_interval_s)
+        if method == "nearest":
+            max_gap_s = MAX_PAIR_TIME_DIFFERENCE_S
+        elif compute_median_interval_s(reference.time_s) > max_interpolated_interval_s:
+            # The path between two poses of a sparse reference is unknown
             method, max_gap_s = "nearest", estimate_interval_s
+        else:
+            max_gap_s = choose_gap_limit_s(reference.time_s)
     time_s = estimate.time_s + time_offset_s
     reference_start_s, reference_end_s = reference.time_s[[0, -1]]
-    max_time_before_or_after_reference_s = 0.0
+    margin_s = 0.0
     if method == "nearest":
-        max_gap_s = max_time_before_or_after_reference_s = (
-            MAX_PAIR_TIME_DIFFERENCE_S if max_gap_s is None else max_gap_s
-        )
+        # Poses just before or after the reference can have a pair
+        margin_s = max_gap_s
         pose_indices, reference_indices = _pair_nearest(
             estimate.time_s, reference.time_s, max_gap_s, time_offset_s
         )
         matched_reference = reference[reference_indices]
     else:
-        max_gap_s = choose_gap_limit_s(reference.time_s) if max_gap_s is None else max_gap_s
         pose_indices = np.flatnonzero(is_bracketed(time_s, reference.time_s, max_gap_s))
         matched_reference = _interpolate_poses(reference, time_s[pose_indices])
     if len(pose_indices) < MIN_POSES:
@@ -106,10 +108,9 @@ def associate(
             "Check that both trajectories are of the same flight. If the clocks differ, "
             "set `time_offset_s` to auto.",
         )
-    is_outside = (time_s < reference_start_s - max_time_before_or_after_reference_s) | (
-        time_s > reference_end_s + max_time_before_or_after_reference_s
-    )
+    is_outside = (time_s < reference_start_s - margin_s) | (time_s > reference_end_s + margin_s)
     pose_count_outside_reference = int(is_outside.sum())
+    # A longer interval between two used poses is a gap, which does not count as covered
     intervals_s = np.diff(time_s[pose_indices])
     covered_duration_s = intervals_s[intervals_s <= max(5.0 * estimate_interval_s, 0.5)].sum()
     used_pose_count, pose_count = len(np.unique(pose_indices)), len(estimate)
@@ -129,7 +130,7 @@ def associate(
 
 def choose_gap_limit_s(time_s: Array, min_gap_limit_s: float = MIN_GAP_LIMIT_S) -> float:
     """Return the default maximum gap (s) for the interpolation of poses."""
-    return max(MAX_GAP_INTERVALS * compute_median_interval_s(time_s), min_gap_limit_s)
+    return max(MAX_GAP_IN_MEDIAN_INTERVALS * compute_median_interval_s(time_s), min_gap_limit_s)
 
 
 def is_bracketed(time_s: Array, reference_time_s: Array, gap_limit_s: float) -> BoolArray:
@@ -164,10 +165,13 @@ def _pair_nearest(
     is_estimate_denser = len(estimate_time_s) > len(reference_time_s)
     sparse_time_s = reference_time_s if is_estimate_denser else estimate_time_s
     dense_time_s = estimate_time_s + offset_s if is_estimate_denser else reference_time_s - offset_s
+    # Each pose of the sparse trajectory is paired with the previous or the next dense pose
     next_indices = np.searchsorted(dense_time_s[1:-1], sparse_time_s, side="right") + 1
     time_to_previous_s = np.abs(sparse_time_s - dense_time_s[next_indices - 1])
     is_next_nearer = np.abs(dense_time_s[next_indices] - sparse_time_s) < time_to_previous_s
-    nearest_indices = next_indices - 1 + is_next_nearer
+    nearest_indices = np.where(is_next_nearer, next_indices, next_indices - 1)
     is_paired = np.abs(dense_time_s[nearest_indices] - sparse_time_s) <= max_difference_s
-    pair_indices = np.flatnonzero(is_paired), nearest_indices[is_paired]
-    return pair_indices[::-1] if is_estimate_denser else pair_indices
+    sparse_indices, dense_indices = np.flatnonzero(is_paired), nearest_indices[is_paired]
+    if is_estimate_denser:
+        return dense_indices, sparse_indices
+    return sparse_indices, dense_indices

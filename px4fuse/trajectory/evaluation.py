@@ -16,7 +16,7 @@ import numpy as np
 
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.core.record import NOT_IN_JSON, NotInJson, OrUnavailable, Record
-from px4fuse.core.text import capitalise_first, format_metres
+from px4fuse.core.text import capitalise_first_letter, format_metres
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.alignment import (
@@ -29,12 +29,12 @@ from px4fuse.trajectory.alignment import (
 from px4fuse.trajectory.association import Association, AssociationMethod, associate
 from px4fuse.trajectory.model import Trajectory, compute_extent_m, cumulative_distance
 from px4fuse.trajectory.scores import (
-    RelativeError,
+    RelativePoseError,
     RmseInterval,
     RpePairDistance,
     Statistics,
     choose_default_deltas,
-    compute_relative_error,
+    compute_relative_pose_error,
     compute_rotation_statistics,
     compute_statistics,
     estimate_rmse_interval,
@@ -49,7 +49,7 @@ MIN_POSE_COUNT_TO_TEST_CONSTANT_ORIENTATION, MIN_EXTENT_TO_TEST_CONSTANT_ORIENTA
 # Minimum duration (s) of a repeated position, and minimum motion (m) of the reference meanwhile
 MIN_FREEZE_DURATION_S, MIN_REFERENCE_MOTION_DURING_FREEZE_M = 2.0, 0.5
 # Minimum jump (m) relative to the reference, and its minimum ratio to the median step error
-MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_RATIO = 0.5, 20.0
+MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_STEP_ERROR_RATIO = 0.5, 20.0
 MAX_STATED_JUMPS = 5
 # Minimum rotation (rad) between the orientations of two trajectories with different body axes
 MIN_ROTATION_BETWEEN_BODY_AXES_RAD = np.radians(30.0)
@@ -109,7 +109,7 @@ def find_jump_warnings(estimate: Trajectory, reference: Trajectory) -> tuple[str
     )
     step_differences_m = steps_of_estimate_m - steps_of_reference_m
     median_difference_m = np.median(np.abs(step_differences_m))
-    min_jump_m = max(MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_RATIO * median_difference_m)
+    min_jump_m = max(MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_STEP_ERROR_RATIO * median_difference_m)
     jump_indices = np.flatnonzero(step_differences_m > min_jump_m)
     if not len(jump_indices):
         return ()
@@ -139,7 +139,7 @@ def has_other_body_axes(aligned_estimate: Trajectory, reference: Trajectory) -> 
 # Maximum deviation of the estimated scale factor from 1 without a warning
 MAX_SCALE_ERROR = 0.1
 # Minimum fraction of poses or time that is evaluated, without a warning
-MIN_EVALUATED_FRACTION = 0.5
+MIN_EVALUATED_TRAJECTORY_FRACTION = 0.5
 # Minimum time offset (s) for a warning, because estimators can have smaller delays
 MIN_REPORTED_TIME_OFFSET_S = 0.1
 # A frame is mirrored if reversing one axis reduces the ATE to this fraction or less
@@ -158,7 +158,7 @@ _KINDS_WITHOUT_KNOWN_VERTICAL = ("slam", "unknown")
 _MONOCULAR_PATTERN = re.compile(r"(?<![a-z])mono(?![a-z])|monocular", re.IGNORECASE)
 
 
-class AbsoluteError(Record):
+class AbsoluteTrajectoryError(Record):
     """Absolute trajectory error (ATE): position (m) and orientation (degrees)."""
 
     translation_m: Statistics
@@ -200,8 +200,8 @@ class Evaluation(Record, kw_only=True):
     transform: Transform
     association: Association
     time_offset: TimeOffset
-    ate: AbsoluteError
-    rpe: tuple[RelativeError, ...]
+    ate: AbsoluteTrajectoryError
+    rpe: tuple[RelativePoseError, ...]
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
     estimate_track: NotInJson[Trajectory] = NOT_IN_JSON
@@ -249,6 +249,7 @@ def evaluate(
     """
     estimate, estimate_notes = drop_constant_orientation(estimate)
     reference, reference_notes = drop_constant_orientation(reference)
+    # 1. Match the poses in time
     time_offset, offset_warnings, better_offset_s = _choose_time_offset(
         estimate, reference, time_offset_s
     )
@@ -261,6 +262,7 @@ def evaluate(
         max_gap_s=max_gap_s,
         time_offset_s=added_offset_s,
     )
+    # 2. Align. If the user did not choose the alignment, insufficient motion is only a warning
     alignment_reason, is_alignment_given = "The user chose the alignment.", alignment is not None
     if alignment is None:
         alignment, alignment_reason = choose_alignment(matched_estimate, matched_reference)
@@ -276,12 +278,15 @@ def evaluate(
             raise
         transform = fit_positions(requires_motion=False)
         warnings.append(
-            f"{capitalise_first(error.reason)}. The ATE may be too small, and rotation errors may "
+            f"{capitalise_first_letter(error.reason)}. The ATE may be too small, and rotation "
+            "errors may "
             "be wrong."
         )
+    # 3. Convert the orientations of the estimate to the body axes of the reference
     aligned_estimate, notes = _rotate_to_reference_body(
         _apply_transform(transform, matched_estimate), matched_reference
     )
+    # A constant rotation between other body axes also needs the lever arm between both origins
     if not notes and has_other_body_axes(aligned_estimate, matched_reference):
         matched_estimate, notes = _move_to_reference_body(
             matched_estimate, matched_reference, alignment
@@ -295,13 +300,14 @@ def evaluate(
             f"{estimate.name} is ground truth, but {reference.name} is not. Give the estimate "
             "first, then the reference."
         )
+    # 4. Compute the errors
     distance_m = cumulative_distance(matched_reference.position_m)
     position_error_m = np.linalg.norm(
         aligned_estimate.position_m - matched_reference.position_m, axis=1
     )
     position_statistics = compute_statistics(position_error_m)
     if better_offset_s is not None:
-        # too few poses may match, or they do not move
+        # With the better time offset, too few poses may match, or they do not move
         with suppress(TrajectoryError):
             better_evaluation = evaluate(
                 estimate,
@@ -324,7 +330,7 @@ def evaluate(
         transform=transform,
         association=association_result,
         time_offset=time_offset,
-        ate=AbsoluteError(
+        ate=AbsoluteTrajectoryError(
             position_statistics,
             estimate_rmse_interval(position_error_m, "ATE"),
             rotations
@@ -332,7 +338,9 @@ def evaluate(
             else compute_rotation_statistics(*rotations),
         ),
         rpe=tuple(
-            compute_relative_error(aligned_estimate, matched_reference, delta, all_pairs=all_pairs)
+            compute_relative_pose_error(
+                aligned_estimate, matched_reference, delta, all_pairs=all_pairs
+            )
             for delta in rpe_deltas
         ),
         time_s=matched_estimate.time_s,
@@ -381,7 +389,7 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
         return "yaw", (
             f"{yaw_text}z is vertical in both frames ({frames_text}), so a tilt counts as an error."
         )
-    scale, scale_reason = 1.0, ""
+    scale = 1.0
     try:
         scale = fit_alignment(estimate.position_m, reference.position_m, "sim3").scale
     except TrajectoryError:
@@ -390,28 +398,31 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
                 f"{yaw_text}motion along a line does not determine all angles, but z is vertical "
                 f"in both frames ({frames_text})."
             )
-    if abs(scale - 1.0) > MAX_SCALE_ERROR:
+    tracks_without_vertical = [
+        track for track in (estimate, reference) if track.kind in _KINDS_WITHOUT_KNOWN_VERTICAL
+    ]
+    se3_text = "Rotation and translation are aligned (6 degrees of freedom): "
+    if not tracks_without_vertical:
+        return "se3", f"{se3_text}the frames {frames_text} have no common vertical direction."
+    cause = "the source of this trajectory is unknown"
+    if tracks_without_vertical[0].kind == "slam":
+        cause = "SLAM uses the frame of the first key frame"
+    frame_reason = (
+        f"the vertical direction of {tracks_without_vertical[0].name} is unknown, because {cause}"
+    )
+    names = [*filter(_MONOCULAR_PATTERN.search, (estimate.name, reference.name))]
+    if names:
+        scale_reason = f"the file name {names[0]} indicates monocular SLAM"
+    elif abs(scale - 1.0) > MAX_SCALE_ERROR:
         scale_reason = (
             f"the scale factor {scale:.3g} differs from 1 by more than {MAX_SCALE_ERROR:.0%}"
         )
-    for track in (reference, estimate):
-        if _MONOCULAR_PATTERN.search(track.name):
-            scale_reason = f"the file name {track.name} indicates monocular SLAM"
-    for track in (estimate, reference):
-        if track.kind in _KINDS_WITHOUT_KNOWN_VERTICAL:
-            cause = "the source of this trajectory is unknown"
-            if track.kind == "slam":
-                cause = "SLAM uses the frame of the first key frame"
-            frame_reason = f"the vertical direction of {track.name} is unknown, because {cause}"
-            if scale_reason:
-                return "sim3", (
-                    "Rotation, translation and scale are aligned (7 degrees of freedom): "
-                    f"{frame_reason}, and {scale_reason}."
-                )
-            break
     else:
-        frame_reason = f"the frames {frames_text} have no common vertical direction"
-    return "se3", f"Rotation and translation are aligned (6 degrees of freedom): {frame_reason}."
+        return "se3", f"{se3_text}{frame_reason}."
+    return "sim3", (
+        "Rotation, translation and scale are aligned (7 degrees of freedom): "
+        f"{frame_reason}, and {scale_reason}."
+    )
 
 
 def _choose_time_offset(
@@ -439,13 +450,14 @@ def _choose_time_offset(
         reason = estimated_offset.reason
         fallback = TimeOffset(offset_s=added_offset_s, is_determinable=False, reason=reason)
         return fallback, [f"{reason} {match_text}"], None
+    time_offset = TimeOffset(offset_s=added_offset_s, is_determinable=True, reason=match_text)
+    # Without an estimate, no other offset is better
     low_s, high_s = estimated_offset.interval_s or (added_offset_s, added_offset_s)
     best_offset_s = estimated_offset.offset_s or added_offset_s
     has_better_offset = (
         not low_s <= added_offset_s <= high_s
         and abs(best_offset_s - added_offset_s) >= MIN_REPORTED_TIME_OFFSET_S
     )
-    time_offset = TimeOffset(offset_s=added_offset_s, is_determinable=True, reason=match_text)
     return time_offset, [], best_offset_s if has_better_offset else None
 
 
@@ -495,12 +507,12 @@ def _find_comparison_warnings(
     *,
     has_jumps: bool,
 ) -> Iterator[str]:
-    if association.coverage_estimate < MIN_EVALUATED_FRACTION:
+    if association.coverage_estimate < MIN_EVALUATED_TRAJECTORY_FRACTION:
         yield (
             f"Only {association.coverage_estimate:.0%} of the estimate is evaluated; the reference "
             "has no poses at the other times."
         )
-    if association.coverage_reference < MIN_EVALUATED_FRACTION:
+    if association.coverage_reference < MIN_EVALUATED_TRAJECTORY_FRACTION:
         yield (
             f"The estimate covers only {association.coverage_reference:.0%} of the reference's "
             "duration."
@@ -509,8 +521,8 @@ def _find_comparison_warnings(
         return
     # Unlike fit_alignment, umeyama also returns the scale for motion along a line
     scale = umeyama(estimate.position_m, reference.position_m, with_scale=True).scale
-    has_motion = np.ptp(reference.position_m, axis=0).any()
-    if alignment != "sim3" and has_motion and abs(scale - 1.0) > MAX_SCALE_ERROR:
+    does_reference_move = np.ptp(reference.position_m, axis=0).any()
+    if alignment != "sim3" and does_reference_move and abs(scale - 1.0) > MAX_SCALE_ERROR:
         yield (
             f"The scale factor of the estimate is {scale:.3g} instead of 1, which the alignment "
             f"{alignment} does not correct."
@@ -554,6 +566,8 @@ def _rotate_to_reference_body(
     aligned_estimate: Trajectory, reference: Trajectory
 ) -> tuple[Trajectory, tuple[str, ...]]:
     """Remove the constant rotation between camera and vehicle axes, and return a note."""
+    # The body axes differ if only one trajectory is in a camera frame, or if one is from SLAM
+    # (camera axes) and the other one is in a frame of vehicles
     vehicle_frames = (*_Z_DOWN_FRAMES, "ENU")
     body_axes_differ = (aligned_estimate.frame == "camera") != (reference.frame == "camera") or any(
         track.kind == "slam"

@@ -67,7 +67,7 @@ def split_by_axis(frame: Frame, vector_m: Array) -> dict[str, float]:
     return dict(zip(AXES_OF_FRAME[frame], vector_m.tolist(), strict=True))
 
 
-class Track(Record):
+class TrajectorySummary(Record):
     """Summary of a trajectory and its file, for results.json."""
 
     name: str
@@ -161,10 +161,10 @@ class Trajectory:
             rotation_variance_rad2=None,
         )
 
-    def describe_track(self) -> Track:
+    def describe_track(self) -> TrajectorySummary:
         """Return a summary of the trajectory for results.json."""
         track_fields = ("name", "sha256", "size_bytes", "kind", "frame", "notes")
-        return Track(
+        return TrajectorySummary(
             **{name: getattr(self, name) for name in track_fields},
             poses=len(self),
             start_s=float(self.time_s[0]),

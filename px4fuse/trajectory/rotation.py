@@ -57,7 +57,7 @@ def build_matrix(*rows: tuple[Array | float, ...]) -> Array:
     return matrices
 
 
-def to_matrix(q: Array) -> Array:
+def to_rotation_matrix(q: Array) -> Array:
     """Convert quaternions to rotation matrices, shape (..., 3, 3)."""
     w, x, y, z = _split_components(q)
     return build_matrix(

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, stdtrit
 
 from px4fuse.core.arrays import Array, IntArray, compute_median_interval_s, rms
-from px4fuse.core.record import Count, NotNegative, OrUnavailable, Record
+from px4fuse.core.record import Count, NonNegativeFloat, OrUnavailable, Record
 from px4fuse.errors import SettingsError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.correlation import autocovariance
@@ -53,10 +53,10 @@ class Statistics(Record):
     """Statistics of a series of errors."""
 
     count: Count
-    rmse: NotNegative
+    rmse: NonNegativeFloat
     mean: float
     median: float
-    std: NotNegative
+    std: NonNegativeFloat
     min: float
     max: float
 
@@ -80,7 +80,7 @@ class RmseInterval(Record):
     blocks: float
 
 
-class RelativeError(Record):
+class RelativePoseError(Record):
     """Relative pose error (RPE) of pairs of poses at a fixed distance.
 
     Attributes
@@ -185,7 +185,8 @@ def find_pose_pairs(
     if not all_pairs:
         return _find_consecutive_pairs(np.diff(distance_or_time), delta.value)
     start_indices = np.arange(pose_count - 1)
-    # Rounding errors may change the nearest pose, so its neighbours are tested too
+    # The nearest pose is the first at or above the distance, or the pose before it. Rounding errors
+    # may change the result, so their neighbours are tested too
     nearest_indices = np.searchsorted(distance_or_time, distance_or_time + delta.value)[:-1]
     candidate_indices = np.clip(
         nearest_indices[:, None] + np.arange(-2, 2), start_indices[:, None] + 1, pose_count - 1
@@ -214,13 +215,13 @@ def _find_consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntAr
     return end_indices[:-1], end_indices[1:]
 
 
-def compute_relative_error(
+def compute_relative_pose_error(
     aligned_estimate: Trajectory,
     reference: Trajectory,
     delta: RpePairDistance,
     *,
     all_pairs: bool = True,
-) -> RelativeError:
+) -> RelativePoseError:
     """Compute the relative pose error (RPE) of pairs of poses at a fixed distance.
 
     The error of a pair (i, j) is E = (Q_i⁻¹ Q_j)⁻¹ (P_i⁻¹ P_j), Sturm (2012), eq. 1.
@@ -236,7 +237,7 @@ def compute_relative_error(
         reference.position_m, reference.time_s, delta, all_pairs=all_pairs
     )
     analysis_name = f"RPE over {delta}"
-    make_result = partial(RelativeError, delta.value, delta.unit, all_pairs, "reference")
+    make_result = partial(RelativePoseError, delta.value, delta.unit, all_pairs, "reference")
     if not len(start_indices):
         no_pairs_result = Unavailable(
             analysis_name,
@@ -295,9 +296,10 @@ def estimate_rmse_interval(
     """
     squared_errors = errors**2
     error_count = len(squared_errors)
-    correlation_time = compute_autocorrelation_time(squared_errors)
+    correlation_time_in_samples = compute_autocorrelation_time(squared_errors)
     block_length = max(
-        int(np.ceil(BLOCK_LENGTH_IN_CORRELATION_TIMES * correlation_time)), min_block_length
+        int(np.ceil(BLOCK_LENGTH_IN_CORRELATION_TIMES * correlation_time_in_samples)),
+        min_block_length,
     )
     if error_count < MIN_BOOTSTRAP_BLOCKS * block_length:
         return Unavailable(
@@ -307,16 +309,18 @@ def estimate_rmse_interval(
             "Use a longer flight.",
         )
     circular_errors = np.append(squared_errors, squared_errors[: block_length - 1])
-    cumulative_errors = np.append(0.0, np.cumsum(circular_errors))
+    cumulative_squared_errors = np.append(0.0, np.cumsum(circular_errors))
     # Mean squared error of each circular block
-    block_means = (cumulative_errors[block_length:] - cumulative_errors[:-block_length]) / (
-        block_length
-    )
+    block_means = (
+        cumulative_squared_errors[block_length:] - cumulative_squared_errors[:-block_length]
+    ) / (block_length)
     block_count = error_count / block_length
     block_starts = np.random.default_rng(BOOTSTRAP_SEED).integers(
         0, error_count, (BOOTSTRAP_RESAMPLES, round(block_count))
     )
     resampled_means = block_means[block_starts].mean(axis=1)
+    # With few blocks, the interval between the 2.5 % and 97.5 % quantiles is too narrow. Other
+    # quantiles give the width of a Student t interval with √(n / (n - 1)) bias correction
     student_t_quantile = float(stdtrit(block_count - 1.0, 0.975))
     tail_probability = float(ndtr(-student_t_quantile * np.sqrt(block_count / (block_count - 1.0))))
     limits = np.quantile(resampled_means, [tail_probability, 1.0 - tail_probability])

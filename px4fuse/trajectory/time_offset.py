@@ -230,14 +230,15 @@ def _find_candidate_offsets_s(sparse_track: Trajectory, dense_track: Trajectory)
     shorter_duration_s = min(float(np.ptp(track.time_s)) for track in (sparse_track, dense_track))
     if shorter_duration_s < 10 * step_s:
         return []
-    sparse_speeds, is_sparse_speed_known = _compute_speeds(sparse_track, step_s)
-    dense_speeds, is_dense_speed_known = _compute_speeds(dense_track, step_s)
+    sparse_track_speeds, is_sparse_speed_known = _compute_speeds(sparse_track, step_s)
+    dense_track_speeds, is_dense_speed_known = _compute_speeds(dense_track, step_s)
     correlations = []
     # If a trajectory has no orientations, only the speeds are correlated, and no angular speeds
-    for sparse_values, dense_values in zip(sparse_speeds, dense_speeds, strict=False):
+    for sparse_values, dense_values in zip(sparse_track_speeds, dense_track_speeds, strict=False):
         moments = compute_moments(
             sparse_values, dense_values, is_sparse_speed_known, is_dense_speed_known
         )
+        # At each lag, the overlap must be long, and both speeds must vary
         is_usable = moments.count >= MIN_OVERLAP_FRACTION * shorter_duration_s / step_s
         # At rest, the variance of the speed is a rounding error
         for values, is_known, square_sum in (
@@ -246,8 +247,8 @@ def _find_candidate_offsets_s(sparse_track: Trajectory, dense_track: Trajectory)
         ):
             mean_square = np.var(values[is_known]) * np.mean(is_known)
             is_usable &= square_sum > 1e-3 * mean_square * moments.count
-        square_product = moments.sum_of_squares_a * moments.sum_of_squares_b
-        scale = np.sqrt(np.where(is_usable, square_product, np.inf))
+        product_of_square_sums = moments.sum_of_squares_a * moments.sum_of_squares_b
+        scale = np.sqrt(np.where(is_usable, product_of_square_sums, np.inf))
         correlations.append(moments.covariance.real / scale)
     correlation = np.mean(correlations, axis=0)
     sliding_maximum = maximum_filter1d(
@@ -317,19 +318,21 @@ def _compute_interval_half_width_s(
         velocities
         - similarity_jacobian @ np.linalg.lstsq(similarity_jacobian, velocities, rcond=None)[0]
     )
-    (dense_track_square_sum, cross_product_sum), (_, sparse_track_square_sum) = (
-        residual_velocities.T @ residual_velocities
-    ).tolist()
+    dense_residuals, sparse_residuals = residual_velocities.T
+    dense_track_square_sum = float(dense_residuals @ dense_residuals)
+    sparse_track_square_sum = float(sparse_residuals @ sparse_residuals)
     if (
         dense_track_square_sum
         <= MIN_RESIDUAL_VELOCITY_FRACTION**2 * float((dense_track_velocity_m_s**2).sum())
-        or cross_product_sum
+        or dense_residuals @ sparse_residuals
         <= MIN_RESIDUAL_VELOCITY_CORRELATION
         * (dense_track_square_sum * sparse_track_square_sum) ** 0.5
     ):
         return float("inf")
+    # Derivative of the log-likelihood with respect to the time offset, for each pose. The poses are
+    # correlated, so the variance of the sum contains the products at other lags
     likelihood_score = (
-        residual_velocities[:, 0].reshape(pose_count, 3)
+        dense_residuals.reshape(pose_count, 3)
         * (fit.dense_track_position_m - fit.aligned_position_m)
     ).sum(axis=1)
     # The lags must exceed the correlation length (Newey and West 1987)
@@ -338,8 +341,12 @@ def _compute_interval_half_width_s(
         pose_count // 4,
     )
     lag_weights = 1.0 - np.arange(1, lag_count + 1) / (lag_count + 1.0)
-    variance_if_uncorrelated, *lagged_products = autocovariance(likelihood_score)[: lag_count + 1]
-    score_variance = variance_if_uncorrelated + max(2.0 * (lag_weights @ lagged_products), 0.0)
+    variance_if_uncorrelated, *lagged_autocovariances = autocovariance(likelihood_score)[
+        : lag_count + 1
+    ]
+    score_variance = variance_if_uncorrelated + max(
+        2.0 * (lag_weights @ lagged_autocovariances), 0.0
+    )
     student_t_quantile = float(stdtrit(max(pose_count / lag_count - 1.0, 1.0), 0.975))
     return float(student_t_quantile * np.sqrt(score_variance) / dense_track_square_sum)
 

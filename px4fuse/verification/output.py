@@ -4,7 +4,7 @@ import hashlib
 from dataclasses import asdict
 from pathlib import Path
 
-from px4fuse.core.text import one_line
+from px4fuse.core.text import shorten_to_line
 from px4fuse.report.page import Page
 from px4fuse.report.style import GOOD_COLOUR, SEVERITY_COLOURS
 from px4fuse.verification.model import Verification
@@ -33,9 +33,9 @@ def verification_page(name: str, verification: Verification, output: Path | None
     page = Page()
     colour_by_outcome = {"verified": GOOD_COLOUR, "cannot verify": SEVERITY_COLOURS["warning"]}
     colour = colour_by_outcome.get(verification.outcome, SEVERITY_COLOURS["error"])
-    page.write(f"{one_line(name, 200)}: {verification.outcome}", bold=True, colour=colour)
+    page.write(f"{shorten_to_line(name, 200)}: {verification.outcome}", bold=True, colour=colour)
     sentences = [
-        one_line(reason, 400)
+        shorten_to_line(reason, 400)
         for reason in verification.reasons
         if reason != VERIFICATION_SCOPE_NOTE
     ]

@@ -27,7 +27,7 @@ from pypdf.generic import (
     TextStringObject,
 )
 
-from px4fuse.core.text import one_line
+from px4fuse.core.text import shorten_to_line
 from px4fuse.core.workers import JobFailure, run_one_with_limits
 from px4fuse.verification.model import PageDifference
 from px4fuse.verification.pdf_input import (
@@ -88,7 +88,7 @@ Operation = tuple[str, tuple[Operand, ...]]
 # Value in the submitted PDF, value in the redrawn PDF (generated again by px4fuse), and their key
 _ValuePair = tuple[Any, Any, str]
 # Description of a difference, and True (_STRUCTURAL) for added or missing PDF objects
-_Difference = tuple[str, bool]
+_PdfDifference = tuple[str, bool]
 _STRUCTURAL, _CONTENT = True, False
 
 
@@ -129,7 +129,7 @@ def _compare_pdfs(job: tuple[bytes, bytes, TextComparison]) -> tuple[PageDiffere
             ]
             producer = (submitted_pdf.metadata or DictionaryObject()).get("/Producer")
             if producer is not None and any(difference.is_structural for difference in differences):
-                program = one_line(str(producer), 60)
+                program = shorten_to_line(str(producer), 60)
                 description = f"another program wrote this file ({program})"
                 differences.insert(0, PageDifference(0, description, True))
             return tuple(differences)
@@ -179,7 +179,7 @@ class _PdfComparison:
         if "/XRefStm" in submitted_pdf.trailer:
             yield PageDifference(0, SECOND_XREF_TABLE_REASON, _STRUCTURAL)
 
-    def _compare(self, pair: _ValuePair) -> Iterator[_Difference]:
+    def _compare(self, pair: _ValuePair) -> Iterator[_PdfDifference]:
         """Yield the differences of two PDF values, including nested values."""
         self.pairs_to_compare = [pair]
         while self.pairs_to_compare:
@@ -219,8 +219,8 @@ class _PdfComparison:
                 # the last pair of the list is compared first
                 self.pairs_to_compare += reversed([(*pair, key) for pair in elements])
             elif not self._is_same_value(submitted_value, redrawn_value):
-                submitted_text = one_line(str(submitted_value), 60)
-                redrawn_text = one_line(str(redrawn_value), 60)
+                submitted_text = shorten_to_line(str(submitted_value), 60)
+                redrawn_text = shorten_to_line(str(redrawn_value), 60)
                 yield (
                     f"the PDF entry {key} was changed to {submitted_text!r}; px4fuse wrote "
                     f"{redrawn_text!r}",
@@ -229,7 +229,7 @@ class _PdfComparison:
 
     def _compare_dictionaries(
         self, submitted_dictionary: Any, redrawn_dictionary: DictionaryObject, key: str
-    ) -> Iterator[_Difference]:
+    ) -> Iterator[_PdfDifference]:
         """Yield the differences in keys and streams of two PDF dictionaries.
 
         Add the pairs of their values to ``pairs_to_compare`` or ``deferred_pairs``.
@@ -239,11 +239,12 @@ class _PdfComparison:
         for name in sorted(submitted_keys ^ redrawn_keys):
             if name in submitted_keys:
                 yield (
-                    f"the PDF contains an entry {one_line(name, 40)}, which px4fuse does not write",
+                    f"the PDF contains an entry {shorten_to_line(name, 40)}, which px4fuse does "
+                    "not write",
                     _STRUCTURAL,
                 )
             else:
-                yield f"the PDF lacks an entry {one_line(name, 40)}", _STRUCTURAL
+                yield f"the PDF lacks an entry {shorten_to_line(name, 40)}", _STRUCTURAL
         # the last pair of the list is compared first
         for name in sorted(submitted_keys & redrawn_keys, reverse=True):
             # /Parent of a page refers to all other pages, so it is compared after all pages
@@ -271,7 +272,7 @@ class _PdfComparison:
 
     def _compare_streams(
         self, submitted_stream: StreamObject, redrawn_stream: StreamObject, key: str
-    ) -> Iterator[_Difference]:
+    ) -> Iterator[_PdfDifference]:
         stream_type = redrawn_stream.get("/Type")
         if stream_type == "/EmbeddedFile":  # attached results: compared in verification.py
             return
@@ -311,7 +312,7 @@ class _PdfComparison:
             if _is_same_operation(submitted, redrawn):
                 continue
             if not {submitted_operator, redrawn_operator} <= _TEXT_OPERATORS:
-                operator_text = one_line(redrawn_operator, 9)
+                operator_text = shorten_to_line(redrawn_operator, 9)
                 return f"PDF drawing operation {number} ({operator_text}) was changed"
             submitted_text = self._decode_text(submitted_operands, font_name)
             redrawn_text = self._decode_text(redrawn_operands, font_name)
@@ -323,8 +324,9 @@ class _PdfComparison:
                 or not self.is_same_text(submitted_text, redrawn_text)
             ):
                 return (
-                    f"the PDF contains the text {one_line(submitted_text, 60)!r}; px4fuse prints "
-                    f"{one_line(redrawn_text, 60)!r}"
+                    f"the PDF contains the text {shorten_to_line(submitted_text, 60)!r}; px4fuse "
+                    "prints "
+                    f"{shorten_to_line(redrawn_text, 60)!r}"
                 )
         return ""
 
@@ -416,12 +418,12 @@ def _parse_drawing_operations(content: bytes) -> Iterator[Operation]:
 
 
 def _unescape(match: re.Match[str]) -> str:
-    escaped = match[1]
-    if escaped is None:  # each end of line in a PDF string means a line feed
+    escaped_characters = match[1]
+    if escaped_characters is None:  # each end of line in a PDF string means a line feed
         return "\n"
-    if escaped[0] in "01234567":
-        return chr(int(escaped, 8) & 255)
-    return _ESCAPED_CHARACTERS.get(escaped, escaped)
+    if escaped_characters[0] in "01234567":
+        return chr(int(escaped_characters, 8) & 255)
+    return _ESCAPED_CHARACTERS.get(escaped_characters, escaped_characters)
 
 
 def _is_same_operation(submitted: Operation, redrawn: Operation) -> bool:

@@ -15,7 +15,7 @@ import pypdf
 from pypdf.errors import DependencyError, LimitReachedError, PyPdfError
 from pypdf.generic import ArrayObject, DictionaryObject, IndirectObject, StreamObject
 
-from px4fuse.core.text import one_line
+from px4fuse.core.text import shorten_to_line
 from px4fuse.errors import ResultsError
 from px4fuse.report.pdf import RESULTS_NAME
 from px4fuse.results.contract import ReportedResults, Results
@@ -68,7 +68,7 @@ PYPDF_LIMITS: dict[str, Any] = {
 }
 
 # Allowed compression methods (filters) of a PDF; _check_file limits their decompressed size
-_ALLOWED_FILTERS = {"/FlateDecode", "/DCTDecode"}
+_ALLOWED_STREAM_FILTERS = {"/FlateDecode", "/DCTDecode"}
 
 _STREAM_START_PATTERN = re.compile(rb"(?<!end)stream *\r?\n?")
 
@@ -90,7 +90,7 @@ def read_report(pdf: bytes, name: str) -> ReportedResults:
     results = read_attached_results(pdf, name)
     if not isinstance(results, ReportedResults):
         raise ResultsError(
-            f"{one_line(name, 200)}: the attached {RESULTS_NAME} has no results of KF or of "
+            f"{shorten_to_line(name, 200)}: the attached {RESULTS_NAME} has no results of KF or of "
             "a loop closure."
         )
     return results
@@ -122,7 +122,7 @@ def read_attached_results(pdf: bytes, name: str) -> Results:
         reason = _ENCRYPTED_REASON
     except BROKEN_PDF_ERRORS:
         reason = _ENCRYPTED_REASON if b"/Encrypt" in pdf else _DAMAGED_REASON
-    raise ResultsError(f"{one_line(name, 200)}: {reason}", remedy)
+    raise ResultsError(f"{shorten_to_line(name, 200)}: {reason}", remedy)
 
 
 def open_strictly(pdf: bytes) -> pypdf.PdfReader:
@@ -144,18 +144,18 @@ def _check_file(pdf: bytes) -> None:
     for stream_match in _STREAM_START_PATTERN.finditer(pdf):
         # compressed data follow the word "stream". Each such word is tested, even inside other
         # data; if no zlib data follow, the size is 0
-        inflated_bytes = _estimate_inflated_bytes(
+        inflated_size_bytes = _estimate_inflated_size_bytes(
             pdf, stream_match.end(), min(remaining_bytes, MAX_CONTENT_BYTES)
         )
-        remaining_bytes -= inflated_bytes
-        if inflated_bytes > MAX_CONTENT_BYTES or remaining_bytes < 0:
+        remaining_bytes -= inflated_size_bytes
+        if inflated_size_bytes > MAX_CONTENT_BYTES or remaining_bytes < 0:
             raise ResultsError(
                 "the decompressed PDF is larger than any px4fuse report: it is not a px4fuse "
                 "report, or was printed to PDF. Hand in the original file."
             )
 
 
-def _estimate_inflated_bytes(pdf: bytes, start: int, limit_bytes: int) -> int:
+def _estimate_inflated_size_bytes(pdf: bytes, start: int, limit_bytes: int) -> int:
     """Estimate the size (bytes) of the zlib data at ``start`` after decompression.
 
     Return 0 if no zlib data start there. Otherwise, the result is at least 1000 and at most
@@ -192,7 +192,7 @@ def _walk_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObje
     yielded twice, with True and with False.
     """
     visited_references: set[tuple[IndirectObject, bool]] = set()
-    missing_count = value_count = 0
+    missing_object_count = value_count = 0
     remaining_values: list[tuple[Any, bool]] = [(reader.trailer, False)]
     while remaining_values:
         value, runs_only_after_click = remaining_values.pop()
@@ -205,10 +205,10 @@ def _walk_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObje
             number, generation = value.idnum, value.generation
             is_in_object_stream = generation == 0 and number in reader.xref_objStm
             is_listed = is_in_object_stream or number in reader.xref.get(generation, {})
-            missing_count += not is_listed
+            missing_object_count += not is_listed
             if (
                 len(visited_references) > MAX_PDF_OBJECTS
-                or missing_count > MAX_UNRESOLVED_REFERENCES
+                or missing_object_count > MAX_UNRESOLVED_REFERENCES
             ):
                 raise ResultsError(_TOO_COSTLY_REASON)
             # a reference to a missing object is null (ISO 32000-1, 7.3.10)
@@ -227,7 +227,9 @@ def _find_unexpected_features(
 ) -> Iterator[str]:
     """Yield names of features that px4fuse never writes, for example scripts or external files."""
     yield from (key[1:] for key in dictionary if _ACTIVE_CONTENT_KEY_PATTERN.fullmatch(key))
-    action, dictionary_type = (_read_pdf_name(dictionary.get(key)) or "" for key in ("/S", "/Type"))
+    action, dictionary_type = (
+        _read_pdf_name_object(dictionary.get(key)) or "" for key in ("/S", "/Type")
+    )
     if _DANGEROUS_ACTION_PATTERN.fullmatch(action):
         yield action[1:]
     if action == "/URI" and not runs_only_after_click:
@@ -241,10 +243,10 @@ def _find_unexpected_features(
     if is_stream:
         filters = resolve_reference(dictionary.get("/Filter"))
         filters = filters if isinstance(filters, ArrayObject) else [filters]
-        names = [_read_pdf_name(each) or "?" for each in filters if each is not None]
+        names = [_read_pdf_name_object(each) or "?" for each in filters if each is not None]
         # a repeated filter could expand to a huge stream
-        if not _ALLOWED_FILTERS.issuperset(names) or len(set(names)) < len(names):
-            compression_text = one_line(" ".join(names[:3]), 60)
+        if not _ALLOWED_STREAM_FILTERS.issuperset(names) or len(set(names)) < len(names):
+            compression_text = shorten_to_line(" ".join(names[:3]), 60)
             yield f"a stream with unsupported compression ({compression_text})"
 
 
@@ -253,7 +255,7 @@ def resolve_reference(value: Any) -> Any:
     return value.get_object() if isinstance(value, IndirectObject) else value
 
 
-def _read_pdf_name(value: object) -> str | None:
+def _read_pdf_name_object(value: object) -> str | None:
     value = resolve_reference(value)
     return str(value) if isinstance(value, str) else None
 
@@ -267,15 +269,15 @@ def _read_attachment(reader: pypdf.PdfReader) -> bytes:
     unexpected_features: set[str] = set()
     for dictionary, runs_only_after_click in _walk_dictionaries(reader):
         unexpected_features.update(_find_unexpected_features(dictionary, runs_only_after_click))
-        if _read_pdf_name(dictionary.get("/Type")) == "/EmbeddedFile":
+        if _read_pdf_name_object(dictionary.get("/Type")) == "/EmbeddedFile":
             streams[id(dictionary)] = dictionary
         if "/EF" in dictionary:
             file_specifications.append(dictionary)
             file_by_key: Any = dictionary["/EF"]
             streams |= {id(each): each for each in map(resolve_reference, file_by_key.values())}
     if unexpected_features:
-        feature_names = ", ".join(sorted(unexpected_features))
-        raise ResultsError(f"the PDF contains {feature_names}, which px4fuse never writes.")
+        feature_names_text = ", ".join(sorted(unexpected_features))
+        raise ResultsError(f"the PDF contains {feature_names_text}, which px4fuse never writes.")
     if not file_specifications and not streams:
         raise ResultsError(
             f"No {RESULTS_NAME} is attached to this PDF. It is not a px4fuse report, or was "
@@ -289,7 +291,7 @@ def _read_attachment(reader: pypdf.PdfReader) -> bytes:
     file_name_keys = {"/UF", "/F", "/DOS", "/Mac", "/Unix"} & file_specification.keys()
     file_names = {str(resolve_reference(file_specification.get(key))) for key in file_name_keys}
     if file_names != {RESULTS_NAME}:
-        name_text = one_line(" / ".join(sorted(file_names)), 80)
+        name_text = shorten_to_line(" / ".join(sorted(file_names)), 80)
         raise ResultsError(f"the name of the attached file is {name_text!r}, not {RESULTS_NAME!r}.")
     attached_bytes = bytes(stream.get_data())
     if len(attached_bytes) > MAX_ATTACHMENT_BYTES:

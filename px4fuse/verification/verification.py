@@ -17,7 +17,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from px4fuse.core.text import clean_text, join_first_names, one_line
+from px4fuse.core.text import clean_text, join_first_names, shorten_to_line
 from px4fuse.errors import Px4FuseError, SettingsError
 from px4fuse.results.contract import (
     ComparisonResults,
@@ -35,7 +35,7 @@ ASK_AUTHOR_REMEDY = (
 )
 INVALID_COMMAND_REASON = "the command in the report is not a command of px4fuse"
 # Minimum KF prediction interval DT (s); the analysis with smaller values would take too long
-MIN_DT_S = 0.01
+MIN_REPEATABLE_DT_S = 0.01
 ORIGINAL_PDF_REMEDY = "Ask the author of the report for the PDF that px4fuse wrote."
 VERIFICATION_SCOPE_NOTE = (
     "Verification confirms that the numbers result from the log. It does not confirm who "
@@ -106,7 +106,7 @@ def recompute_report(
         with tempfile.TemporaryDirectory(prefix="px4fuse-") as folder:
             link_input_file = partial(_link_input_file, path_by_sha256, Path(folder))
             if isinstance(results, LoopResults):
-                analysis, new_results = _repeat_loop_closure(results, link_input_file)
+                analysis, new_results = _repeat_loop_analysis(results, link_input_file)
             else:
                 analysis, new_results = _repeat_comparison(results, link_input_file)
         return new_results, partial(_draw_report, analysis, new_results, results.provenance)
@@ -130,7 +130,7 @@ def _link_input_file(
     """
     path = None if sha256 is None else path_by_sha256.get(sha256)
     if path is None:
-        missing_file_name = one_line(name, 80) or "the file"
+        missing_file_name = shorten_to_line(name, 80) or "the file"
         reason = f"none of the given files has the SHA-256 of {file_label}"
         raise NotRepeatableError(
             reason, f"Add {missing_file_name} to the --logs folder.", missing_file_name
@@ -163,8 +163,10 @@ def _repeat_comparison(
     from px4fuse.results.build import make_comparison_results  # noqa: PLC0415
 
     recorded_request = submitted_results.request
-    if recorded_request.dt_s < MIN_DT_S:
-        raise NotRepeatableError(f"DT is below {MIN_DT_S:g} s, so the analysis would take too long")
+    if recorded_request.dt_s < MIN_REPEATABLE_DT_S:
+        raise NotRepeatableError(
+            f"DT is below {MIN_REPEATABLE_DT_S:g} s, so the analysis would take too long"
+        )
     hash_by_role = {file.role: file.sha256 for file in submitted_results.log.joined}
     request = replace(
         recorded_request,
@@ -177,7 +179,7 @@ def _repeat_comparison(
     return analysis, make_comparison_results(recorded_request, analysis, submitted_results.student)
 
 
-def _repeat_loop_closure(
+def _repeat_loop_analysis(
     submitted_results: LoopResults, link_input_file: _LinkInputFile
 ) -> tuple[object, ReportedResults]:
     from px4fuse.diagnose import analyse_loop_closure  # noqa: PLC0415
@@ -232,7 +234,7 @@ def verify(
     log_name = (
         split_track(results.track.name)[0] if isinstance(results, LoopResults) else results.log.name
     )
-    log_file_name = one_line(log_name, 80) or "the log"
+    log_file_name = shorten_to_line(log_name, 80) or "the log"
     if not path_by_sha256:
         return make_unverifiable_result(
             NO_LOG_REASON, f"Add {log_file_name} to the --logs folder.", log_file_name
@@ -255,7 +257,7 @@ def make_unverifiable_result(
     reason: str, remedy: str = ASK_AUTHOR_REMEDY, missing_input: str = ""
 ) -> Verification:
     """Return the status "cannot verify" with its reason."""
-    reasons = (one_line(reason, 400),)
+    reasons = (shorten_to_line(reason, 400),)
     return Verification("cannot verify", reasons, False, remedy=remedy, missing=missing_input)
 
 
@@ -312,7 +314,7 @@ def _compare_with_new_report(
         reasons = [*page_reasons, values_reason]
     remedy = ""
     if other_libraries:
-        versions_text = one_line(", ".join(map(" ".join, sorted(other_libraries))), 300)
+        versions_text = shorten_to_line(", ".join(map(" ".join, sorted(other_libraries))), 300)
         reasons.append(
             f"the report was made with {versions_text}; this computer has other versions, so "
             "pages may look different"
@@ -375,10 +377,10 @@ def compare_results(
         for path in {**new_values, **recorded_values}
         if not path.startswith(MACHINE_DEPENDENT_FIELDS)
     }
-    mismatched_paths, other_paths, unequal_numbers = [], [], []
+    mismatched_paths, non_number_paths, unequal_numbers = [], [], []
     for path, (recorded_value, new_value) in value_pair_by_path.items():
         if not is_number(recorded_value) or not is_number(new_value):
-            other_paths.append(path)
+            non_number_paths.append(path)
             continue
         is_estimated = has_estimated_settings or path.startswith(ESTIMATE_FIELDS)
         if not _is_within_tolerance(path, recorded_value, new_value, is_estimated):
@@ -390,11 +392,13 @@ def compare_results(
     is_same_number = partial(is_same_number_up_to_rounding, unequal_numbers)
     mismatched_paths += [
         path
-        for path in other_paths
+        for path in non_number_paths
         if not _is_equal_after_rounding(*value_pair_by_path[path], is_same_number)
     ]
     mismatches = (
-        Mismatch(one_line(path, MAX_TEXT_LENGTH), *map(_format_value, value_pair_by_path[path]))
+        Mismatch(
+            shorten_to_line(path, MAX_TEXT_LENGTH), *map(_format_value, value_pair_by_path[path])
+        )
         for path in mismatched_paths
     )
     return tuple(mismatches), is_same_number, len(value_pair_by_path)
@@ -477,4 +481,4 @@ def _count_decimals(number: str) -> int:
 
 
 def _format_value(value: Any) -> str:
-    return "absent" if value is _ABSENT else one_line(str(value), MAX_TEXT_LENGTH)
+    return "absent" if value is _ABSENT else shorten_to_line(str(value), MAX_TEXT_LENGTH)

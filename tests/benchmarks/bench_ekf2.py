@@ -20,19 +20,19 @@ from pathlib import Path
 import numpy as np
 
 from px4fuse.ekf2.model import Ekf2Model, prepare_ekf2_model, replay_with_settings
-from px4fuse.ekf2.replay import Agreement
+from px4fuse.ekf2.replay import ReplayAgreement
 from px4fuse.ekf2.steps import (
-    ACCELEROMETER_BIAS_PROPERTY,
-    ATTITUDE_PROPERTY,
-    FLOW_PROPERTY,
-    GNSS_VELOCITY_PROPERTY,
-    MAGNETOMETER_PROPERTY,
-    MEASUREMENT_NOISE_PROPERTY,
-    OUTPUT_PREDICTOR_PROPERTY,
-    PROCESS_NOISE_PROPERTY,
-    REJECTION_PROPERTY,
-    SAMPLE_TIMES_PROPERTY,
-    TIMESTAMPS_PROPERTY,
+    ACCELEROMETER_BIAS_REPLACEMENT_NAME,
+    ATTITUDE_REPLACEMENT_NAME,
+    FLOW_REPLACEMENT_NAME,
+    GNSS_VELOCITY_REPLACEMENT_NAME,
+    MAGNETOMETER_REPLACEMENT_NAME,
+    MEASUREMENT_NOISE_REPLACEMENT_NAME,
+    OUTPUT_PREDICTOR_REPLACEMENT_NAME,
+    PROCESS_NOISE_REPLACEMENT_NAME,
+    REJECTION_REPLACEMENT_NAME,
+    SAMPLE_TIMES_REPLACEMENT_NAME,
+    TIMESTAMPS_REPLACEMENT_NAME,
 )
 from px4fuse.ekf2.whatif import Ekf2Statistics, WhatIf, what_if
 from px4fuse.flight.model import Flight, Unavailable
@@ -108,17 +108,17 @@ def waterfalls(models: dict[str, Ekf2Model]) -> dict[str, float]:
 
     unexplained = {}
     steps = (
-        SAMPLE_TIMES_PROPERTY,
-        TIMESTAMPS_PROPERTY,
-        MEASUREMENT_NOISE_PROPERTY,
-        ACCELEROMETER_BIAS_PROPERTY,
-        PROCESS_NOISE_PROPERTY,
-        ATTITUDE_PROPERTY,
-        MAGNETOMETER_PROPERTY,
-        GNSS_VELOCITY_PROPERTY,
-        FLOW_PROPERTY,
-        REJECTION_PROPERTY,
-        OUTPUT_PREDICTOR_PROPERTY,
+        SAMPLE_TIMES_REPLACEMENT_NAME,
+        TIMESTAMPS_REPLACEMENT_NAME,
+        MEASUREMENT_NOISE_REPLACEMENT_NAME,
+        ACCELEROMETER_BIAS_REPLACEMENT_NAME,
+        PROCESS_NOISE_REPLACEMENT_NAME,
+        ATTITUDE_REPLACEMENT_NAME,
+        MAGNETOMETER_REPLACEMENT_NAME,
+        GNSS_VELOCITY_REPLACEMENT_NAME,
+        FLOW_REPLACEMENT_NAME,
+        REJECTION_REPLACEMENT_NAME,
+        OUTPUT_PREDICTOR_REPLACEMENT_NAME,
     )
     print("\nwhy EKF2 differs | total rms m | " + " | ".join(steps) + " | left")
     for name, model in models.items():
@@ -171,7 +171,7 @@ def agreement_page(models: dict[str, Ekf2Model], left: dict[str, float]) -> str:
     return "\n\n".join(["\n".join(lines), *notes])
 
 
-def height_notes(name: str, agreement: Agreement) -> list[str]:
+def height_notes(name: str, agreement: ReplayAgreement) -> list[str]:
     """Return the note on a flight with replayed heights, or no note."""
     heights = [*agreement.gnss_hgt.values(), *agreement.baro_hgt.values()]
     if not heights or agreement.doubtful:

@@ -22,7 +22,7 @@ from pathlib import Path
 
 from click.testing import CliRunner
 
-from px4fuse.classroom.grading.rubric import rubric_text
+from px4fuse.classroom.grading.rubric import read_default_rubric_text
 from px4fuse.cli import cli
 from px4fuse.simulation.flights import simulate, to_ulog
 from px4fuse.simulation.scenario import Scenario
@@ -108,8 +108,10 @@ def main() -> None:
             taken = list(pool.map(make, jobs))
         alone = sum(taken[4:]) / len(taken[4:])  # the first reports include imports
         first, other = folder / "first.toml", folder / "other.toml"
-        first.write_text(rubric_text(), encoding="utf-8")
-        other.write_text(rubric_text().replace("points = 10", "points = 12"), encoding="utf-8")
+        first.write_text(read_default_rubric_text(), encoding="utf-8")
+        other.write_text(
+            read_default_rubric_text().replace("points = 10", "points = 12"), encoding="utf-8"
+        )
         found = graded(folder, reports, first)
         each = found["seconds"] / found["reports"]
         print(

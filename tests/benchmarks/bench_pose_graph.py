@@ -31,7 +31,7 @@ SIZES = (100, 300, 1000, 3000, 10_000)
 def chain(poses: int):
     """Make laps of 50 poses in space; every tenth pose has a closure to the previous lap."""
     from px4fuse.trajectory.graph import lie
-    from px4fuse.trajectory.graph.model import PoseGraph, compose_odometry
+    from px4fuse.trajectory.graph.model import PoseGraph, set_poses_from_odometry
 
     rng = np.random.default_rng(0)
     step = np.array([1.0, 0.0, 0.02, 0.0, 0.01, 2.0 * np.pi / 50])
@@ -42,7 +42,9 @@ def chain(poses: int):
     noise = lie.exp(rng.normal(size=(len(i), 6)) * spread)
     measured = lie.compose(lie.relative_pose(truth[i], truth[j]), noise)
     information = np.tile(np.diag(spread**-2.0), (len(i), 1, 1))
-    return compose_odometry(PoseGraph(3, np.arange(poses), truth, i, j, measured, information))
+    return set_poses_from_odometry(
+        PoseGraph(3, np.arange(poses), truth, i, j, measured, information)
+    )
 
 
 def main() -> None:

@@ -37,7 +37,7 @@ from px4fuse.diagnose import (
 )
 from px4fuse.errors import Px4FuseError
 from px4fuse.filter.time_offset import SourceTimeOffset
-from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
 from px4fuse.flight.model import Flight
 from px4fuse.report import clock, tuning
 from px4fuse.request import ComparisonRequest, WhatIfRequest
@@ -93,7 +93,7 @@ def flight_outputs(request: ComparisonRequest, flight: Flight | None = None) -> 
         return {}
     outputs: Outputs = {
         "json": to_json_dict(build.make_comparison_results(request, analysis)),
-        "parameters": {n: v for n, v in flight.log.parameters.items() if n in PARAMETERS},
+        "parameters": {n: v for n, v in flight.log.parameters.items() if n in MODEL_PARAMETERS},
     }
     comparison = prepare_comparison(flight, request)
     noises = estimate_noises(comparison)

@@ -27,7 +27,7 @@ from px4fuse.ekf2.replay import (
 )
 from px4fuse.ekf2.whatif import Ekf2Statistics, WhatIf, what_if
 from px4fuse.errors import SettingsError
-from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
 from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable
 from px4fuse.readers import read_log
 
@@ -82,7 +82,7 @@ def changed_parameters(before: FlownFlight, after: FlownFlight) -> dict[str, flo
     return {
         name: value
         for name, value in second.items()
-        if name in PARAMETERS and first.get(name) != value
+        if name in MODEL_PARAMETERS and first.get(name) != value
     }
 
 

@@ -40,7 +40,7 @@ from px4fuse.diagnose import diagnose, prepare_comparison, read_flight
 from px4fuse.ekf2.model import Ekf2Model, misalign_positions, prepare_ekf2_model
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.errors import Px4FuseError
-from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
 from px4fuse.flight.model import Truth, Unavailable
 from px4fuse.request import ComparisonRequest, PositionFile
 from px4fuse.results import build
@@ -97,7 +97,7 @@ def proposed(outputs: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any], str
         changes = dict(re.findall(rf"param set {PARAMETER} {NUMBER}", text))
         if sentence := re.search(rf"(?:Set|Increase) {PARAMETER} to .*?(?:\.\s|\.$|$)", text):
             changes |= dict(re.findall(rf"{PARAMETER} to {NUMBER}", sentence[0]))
-        known = {name: float(value) for name, value in changes.items() if name in PARAMETERS}
+        known = {name: float(value) for name, value in changes.items() if name in MODEL_PARAMETERS}
         if known:
             yield "EKF2", known, place
         if found := re.search(rf"(?i)(subtract|add) {NUMBER} s (?:from|to) the timestamp", text):

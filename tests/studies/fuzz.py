@@ -46,13 +46,13 @@ from px4fuse.classroom.assignment.key import (  # noqa: E402
     read_answer_key,
 )
 from px4fuse.classroom.assignment.roster import (  # noqa: E402
+    read_csv_sheet,
     read_people,
     read_roster,
-    read_sheet,
 )
 from px4fuse.classroom.grading import grade as grading  # noqa: E402
 from px4fuse.classroom.grading.entries import read_overrides  # noqa: E402
-from px4fuse.classroom.grading.rubric import read_rubric, rubric_text  # noqa: E402
+from px4fuse.classroom.grading.rubric import read_default_rubric_text, read_rubric  # noqa: E402
 from px4fuse.cli import cli  # noqa: E402
 from px4fuse.core import workers  # noqa: E402
 from px4fuse.diagnose import diagnose_or_check_aids  # noqa: E402
@@ -219,7 +219,7 @@ def _key() -> list[bytes]:
 
 
 def _class_list(path: Path) -> object:
-    return read_people(read_sheet(path))
+    return read_people(read_csv_sheet(path))
 
 
 TARGETS = (
@@ -238,7 +238,8 @@ TARGETS = (
         lambda path: read_results(path.read_bytes()), ".json", True, 100, 2.0,
     ),
     Target("report", _reports, _report, ".pdf", False, 60, 0.2),
-    Target("rubric", lambda: [rubric_text().encode()], read_rubric, ".toml", True, 900, 8.0),
+    Target("rubric", lambda: [read_default_rubric_text().encode()],
+           read_rubric, ".toml", True, 900, 8.0),
     Target("overrides", _text(_OVERRIDES), read_overrides, ".csv", True, 900, 6.0),
     Target("roster", _text(_ROSTER, _MOODLE), read_roster, ".csv", True, 900, 6.0),
     Target("class list", _text(_ROSTER, _MOODLE), _class_list, ".csv", True, 900, 6.0),
@@ -291,7 +292,7 @@ LOG = str(REPOSITORY / "sample_logs/aisle_uwb.ulg")
 COMMANDS = (
     Target("grade", _handed_in, _command("grade", "{path}", "--logs", LOG, "-o", "{out}"), ".zip",
            False, 2, 1.0, COMMAND_S),
-    Target("grade by rubric", lambda: [rubric_text().encode()],
+    Target("grade by rubric", lambda: [read_default_rubric_text().encode()],
            _command("grade", str(REPORT), "--logs", LOG, "--rubric",
                     "{path}", "-o", "{out}"), ".toml", True, 2, 1.0, COMMAND_S),
     Target("verify", lambda: [(REPORT).read_bytes()],

@@ -47,7 +47,7 @@ from ulog_tools import load  # noqa: E402
 
 from px4fuse.classroom.assignment.key import AnswerKey, format_answer_key  # noqa: E402
 from px4fuse.classroom.grading import grade as grading  # noqa: E402
-from px4fuse.classroom.grading.rubric import rubric_text  # noqa: E402
+from px4fuse.classroom.grading.rubric import read_default_rubric_text  # noqa: E402
 from px4fuse.cli import COMMANDS, cli  # noqa: E402
 from px4fuse.core import workers  # noqa: E402
 from px4fuse.errors import Px4FuseError  # noqa: E402
@@ -176,7 +176,8 @@ def make_desk(folder: Path) -> None:
         "notes.md": "# Title\n\n* words **bold** $x^2$\n",
         "secret.txt": "a secret of enough letters",
         "roster.csv": "id,name\n1,Ada\n2,山田\n", "sheet.csv": "id,name,grade\n1,Ada,\n",
-        "rubric.toml": rubric_text(), "key.json": format_answer_key(AnswerKey("aisle", ())),
+        "rubric.toml": read_default_rubric_text(),
+        "key.json": format_answer_key(AnswerKey("aisle", ())),
     }.items():  # fmt: skip
         (folder / name).write_text(text, encoding="utf-8")
     os.chdir(folder)

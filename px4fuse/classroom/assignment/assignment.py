@@ -8,7 +8,7 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from px4fuse.classroom.assignment.figures import draw_figures, select_choices
+from px4fuse.classroom.assignment.figures import draw_figures, make_choice_questions
 from px4fuse.classroom.assignment.key import (
     AnswerKey,
     CorrectAnswers,
@@ -23,7 +23,7 @@ from px4fuse.classroom.assignment.random_assignment import (
     draw_uniform,
 )
 from px4fuse.classroom.assignment.roster import Person, normalise_text
-from px4fuse.core.input_files import suspend_input_registration
+from px4fuse.core.input_files import protect_inputs
 from px4fuse.core.text import to_json_types
 from px4fuse.core.writing import write_output_files
 from px4fuse.errors import OutputError
@@ -49,9 +49,9 @@ def simulate_assigned_flight(
     log = flights.to_ulog(simulation, is_assessed=True)
     sha256 = hashlib.sha256(log).hexdigest()
     true_values = flights.compute_true_values(simulation)
-    form_answers = replace(
+    right_form_answers = replace(
         compute_form_answers(simulation, sha256),
-        choices=select_choices(partial(draw_uniform, secret, student.student_id, kind)),
+        choices=make_choice_questions(partial(draw_uniform, secret, student.student_id, kind)),
     )
     return log, CorrectAnswers(
         student_id=student.student_id,
@@ -65,7 +65,7 @@ def simulate_assigned_flight(
             name: value for name, value in true_values.items() if isinstance(value, float)
         },
         difficulty=assigned_flight.difficulty,
-        form=form_answers,
+        form=right_form_answers,
     )
 
 
@@ -124,7 +124,7 @@ def write_assignment(
     OutputError
         A file exists with other content, or cannot be written.
     """
-    with suspend_input_registration():
+    with protect_inputs(is_active=False):
         key = read_answer_key(key_file) if key_file.exists() else AnswerKey(kind, ())
     answers = {normalise_text(answer.student_id): answer for answer in key.answers}
     # an answer key without these students belongs to another class

@@ -74,7 +74,9 @@ def _select_fault_kinds(draw_number: Callable[[str], float]) -> dict[str, str]:
     return {f"Figure {number}": kind for number, kind in enumerate(fault_kinds, start=1)}
 
 
-def select_choices(draw_number: Callable[[str], float]) -> tuple[tuple[Choice, ChoiceLetter], ...]:
+def make_choice_questions(
+    draw_number: Callable[[str], float],
+) -> tuple[tuple[Choice, ChoiceLetter], ...]:
     """Make the multiple-choice questions about a student's plots, each with its right letter.
 
     ``draw_number`` returns a random number in [0, 1) for a name. The number is always the same for
@@ -99,7 +101,7 @@ def select_choices(draw_number: Callable[[str], float]) -> tuple[tuple[Choice, C
 def draw_figures(draw_number: Callable[[str], float]) -> bytes:
     """Simulate and plot the flights for a student's multiple-choice questions; return one PNG file.
 
-    ``draw_number`` is as in :func:`select_choices`.
+    ``draw_number`` is as in :func:`make_choice_questions`.
     """
     comparisons = {}
     for title, kind in _select_fault_kinds(draw_number).items():

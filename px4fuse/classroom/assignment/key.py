@@ -30,7 +30,7 @@ from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.request import SIGMA_Z_M, ComparisonRequest
 from px4fuse.results.answer_form import (
-    GATE_QUESTION_FURTHER_UPDATES,
+    LATER_UPDATE_COUNT_IN_GATE_QUESTION,
     Choice,
     ChoiceLetter,
     FormQuestion,
@@ -43,11 +43,11 @@ from px4fuse.simulation.sensors import TIMESYNC_CONVERGENCE_TIME_S
 # Maximum relative error of the size of a fault in a student's answer
 FAULT_SIZE_TOLERANCE_FRACTION = 0.15
 # Maximum deviation (m) of a student's loop closure error from the right value
-CLOSURE_TOLERANCE_M = 0.3
+CLOSURE_ERROR_TOLERANCE_M = 0.3
 # Minimum fraction of positions rejected by EKF2 for which the student must report rejections
 MIN_REJECTED_FRACTION = 0.005
 # Minimum size (m) of an EKF2 position reset that the student must report
-MIN_RESET_M = 0.2
+MIN_POSITION_RESET_TO_REPORT_M = 0.2
 # Time (s) at the start in which position resets are ignored: EKF2 resets to its first position
 INITIAL_TIME_WITHOUT_RESETS_S = 5.0
 # Faults for which a student must ("required") or may ("allowed") report a behaviour of EKF2
@@ -177,7 +177,7 @@ class AnswerKey(msgspec.Struct, frozen=True):
     def __repr__(self) -> str:  # an error message must not show the secret
         return f"AnswerKey({self.kind!r}, {len(self.answers)} students)"
 
-    def find_student_answers(self, student_id: str) -> CorrectAnswers | None:
+    def find_right_answers_of_student(self, student_id: str) -> CorrectAnswers | None:
         """Return the right answers for a student; None for an unknown student."""
         class_list = ClassList(Person(answer.student_id) for answer in self.answers)
         student_index = class_list.find_student_index(Person(student_id))
@@ -262,7 +262,7 @@ def _make_injected_fault(
         odometry = trajectory_of(comparison.flight, "vio")
         closure_error_m = analyse(LoopSource(odometry, comparison.flight)).closure_error_m
         size = closure_error_m if isinstance(closure_error_m, float) else size
-        tolerance = CLOSURE_TOLERANCE_M
+        tolerance = CLOSURE_ERROR_TOLERANCE_M
     low, high = size - tolerance, size + tolerance
     if name == "clock-offset":
         # also accept the estimate of px4fuse, a correction with the opposite sign of the fault
@@ -343,7 +343,7 @@ def _has_position_reset(comparison: Comparison) -> bool:
     return isinstance(ekf2, Ekf2) and any(
         reset.quantity == "position"
         and reset.time_s > earliest_counted_reset_time_s
-        and math.hypot(*reset.delta[:2]) > MIN_RESET_M
+        and math.hypot(*reset.delta[:2]) > MIN_POSITION_RESET_TO_REPORT_M
         for reset in ekf2.resets
     )
 
@@ -360,7 +360,9 @@ def compute_numeric_answer(
         return None
     nis = updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]
     if question.kind == "gate":
-        is_outside = nis.iloc[: GATE_QUESTION_FURTHER_UPDATES + 1] > question.question_parameter**2
+        is_outside = (
+            nis.iloc[: LATER_UPDATE_COUNT_IN_GATE_QUESTION + 1] > question.question_parameter**2
+        )
         rejected_update_numbers = np.flatnonzero(is_outside) + question.update_number
         return tuple(rejected_update_numbers.astype(float).tolist())
     covariance = kf_run.steps.loc[updates.index[0], COVARIANCE_COLUMNS]

@@ -32,7 +32,7 @@ PROBABILITY_BY_FAULT_COUNT: dict[ScenarioKind, tuple[float, ...]] = {
     "loop": (0.4, 0.6),
 }
 # Probability of a loop if the kind of flight is "mixed"
-LOOP_PROBABILITY = 1 / 3
+LOOP_FLIGHT_PROBABILITY = 1 / 3
 # Range of the difficulty of an injected fault: smallest size that px4fuse detects ÷ injected size.
 # A fault with difficulty 1 is just detectable
 EASIEST_DIFFICULTY, HARDEST_DIFFICULTY = 0.6, 1.0
@@ -179,7 +179,7 @@ def assign_random_flight(
             f"{max_fault_count} faults."
         )
     if kind == "mixed":
-        is_loop = draw_uniform(secret, student_id, kind, "kind") < LOOP_PROBABILITY
+        is_loop = draw_uniform(secret, student_id, kind, "kind") < LOOP_FLIGHT_PROBABILITY
         kind = "loop" if is_loop else "aisle"
     draw_number = partial(draw_uniform, secret, student_id, kind)
     if fault_count is None:

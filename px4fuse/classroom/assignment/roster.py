@@ -17,7 +17,7 @@ from pathlib import Path
 
 from px4fuse.core.reading import read_bytes_limited
 from px4fuse.core.record import read_toml
-from px4fuse.core.text import one_line
+from px4fuse.core.text import shorten_to_line
 from px4fuse.errors import SettingsError
 
 MAX_TABLE_BYTES = 20_000_000
@@ -86,7 +86,7 @@ def normalise_title(title: str) -> str:
     return "".join(filter(str.isalnum, title.casefold()))
 
 
-def read_sheet(path: Path) -> Sheet:
+def read_csv_sheet(path: Path) -> Sheet:
     """Read a CSV table with a header.
 
     Raises
@@ -204,7 +204,7 @@ def read_people(sheet: Sheet) -> tuple[Person, ...]:
         if normalised_id and row_number_by_id.setdefault(normalised_id, row_number) != row_number:
             raise SettingsError(
                 f"{sheet.path}: rows {row_number_by_id[normalised_id]} and {row_number} have the "
-                f"same id {one_line(person.student_id, 40)!r}.",
+                f"same id {shorten_to_line(person.student_id, 40)!r}.",
                 "Give each student a unique id.",
             )
         people.append(person)
@@ -219,7 +219,7 @@ def read_roster(path: Path) -> tuple[Person, ...]:
     SettingsError
         The file is not a valid table of 1 to MAX_STUDENTS students.
     """
-    people = read_people(read_sheet(path))
+    people = read_people(read_csv_sheet(path))
     if not people or len(people) > MAX_STUDENTS:
         raise SettingsError(
             f"{path} contains {len(people)} students.",
@@ -229,7 +229,7 @@ def read_roster(path: Path) -> tuple[Person, ...]:
     for person in people:
         stem = make_file_stem(person.student_id)
         if stem is None or person_by_stem.setdefault(stem.casefold(), person) is not person:
-            student_text = one_line(person.student_id or person.name, 40)
+            student_text = shorten_to_line(person.student_id or person.name, 40)
             raise SettingsError(
                 f"{path}: the id of {student_text!r} cannot be used as a file name.",
                 "Give each student a unique id with letters or digits.",
@@ -240,7 +240,7 @@ def read_roster(path: Path) -> tuple[Person, ...]:
 def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
     """Return the student in a table row; None for a row without a student."""
     cells = {
-        field_name: one_line(sheet.find_cell(row, titles), MAX_NAME_LENGTH)
+        field_name: shorten_to_line(sheet.find_cell(row, titles), MAX_NAME_LENGTH)
         for field_name, titles in TITLES_BY_FIELD.items()
     }
     name = cells["name"] or f"{cells['first']} {cells['last']}".strip()
@@ -254,7 +254,7 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
     if sheet.find_column_index(("sisuserid", "sisloginid")) is not None:
         if canvas_number := sheet.find_cell(row, ("id",)):
             numbers["canvas"] = canvas_number
-        cells["student_id"] = one_line(sheet.find_cell(row, ("sisuserid",)), MAX_NAME_LENGTH)
+        cells["student_id"] = shorten_to_line(sheet.find_cell(row, ("sisuserid",)), MAX_NAME_LENGTH)
     student_id = cells["student_id"] or cells["login"] or cells["email"]
     person = Person(
         student_id,
@@ -285,19 +285,19 @@ class ClassList:
                     student, numbers=other_person.numbers | student.numbers, **fields
                 )
 
-    def find_student_index(self, searched: Person) -> int | None:
+    def find_student_index(self, searched_person: Person) -> int | None:
         """Return the index of a person in ``people``; None for an unknown person.
 
         The fields are compared in this order: platform number, id, email, login, name.
         """
         conditions: tuple[Callable[[Person], bool], ...] = (
-            lambda person: bool(person.numbers.items() & searched.numbers.items()),
-            lambda person: _is_same_text(person.student_id, searched.student_id),
-            lambda person: is_same_id(person.student_id, searched.student_id),
-            lambda person: _is_same_text(person.email, searched.email),
+            lambda person: bool(person.numbers.items() & searched_person.numbers.items()),
+            lambda person: _is_same_text(person.student_id, searched_person.student_id),
+            lambda person: is_same_id(person.student_id, searched_person.student_id),
+            lambda person: _is_same_text(person.email, searched_person.email),
             # a class list without a login column may contain logins in its id column
-            lambda person: _is_same_text(person.login or person.student_id, searched.login),
-            lambda person: is_same_name(person.name, searched.name),
+            lambda person: _is_same_text(person.login or person.student_id, searched_person.login),
+            lambda person: is_same_name(person.name, searched_person.name),
         )
         for is_same_person in conditions:
             matches = [index for index, each in enumerate(self.people) if is_same_person(each)]
@@ -338,9 +338,12 @@ def is_same_name(name: str, other_name: str) -> bool:
     if sorted(words) == sorted(other_words):
         return bool(words)
     # one name may be joined, and begin with any of the words: "lovelaceada"
-    shorter, longer = sorted((words, other_words), key=len)
-    rotations = ("".join(longer[start:] + longer[:start]) for start in range(len(longer)))
-    return len(shorter) == 1 and shorter[0] in rotations
+    shorter_name_words, longer_name_words = sorted((words, other_words), key=len)
+    rotations = (
+        "".join(longer_name_words[start:] + longer_name_words[:start])
+        for start in range(len(longer_name_words))
+    )
+    return len(shorter_name_words) == 1 and shorter_name_words[0] in rotations
 
 
 def make_file_stem(student_id: str) -> str | None:

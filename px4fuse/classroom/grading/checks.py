@@ -15,7 +15,7 @@ from px4fuse.classroom.assignment.key import AnswerKey, CorrectAnswers
 from px4fuse.classroom.grading.form_points import FormPoints, compute_form_points
 from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.core.record import Record, Share
-from px4fuse.core.text import capitalise_first, format_factor, format_metres, one_line
+from px4fuse.core.text import capitalise_first_letter, format_factor, format_metres, shorten_to_line
 from px4fuse.filter.consistency import HorizontalNis
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL
@@ -34,7 +34,7 @@ MAX_QUOTE_LENGTH = 160
 FORM_MISMATCH_REASON = "your answer form and your report are about different logs"
 BOTH_AXES_ADVICE = "Make the report without --axis: the axes north and east are required"
 # Text without control characters; a title is not blank
-Text = Annotated[str, Meta(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+OneLineText = Annotated[str, Meta(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
 Title = Annotated[str, Meta(max_length=200, pattern=r"^(?=.*\S)[^\x00-\x1f\x7f]*$")]
 Bound = Annotated[float, Meta(ge=-1e12, le=1e12)]
 ErrorFactorAtZeroScore = Annotated[float, Meta(ge=1.0, le=1000.0)]
@@ -122,9 +122,9 @@ class ScoringInput:
         """Right answers for the log that the instructor gave to the student."""
         if self.key is None:
             return None
-        return self.key.find_student_answers(self.submitter_id) or self.key.find_student_answers(
-            shorten_text(self.results.student.id)
-        )
+        return self.key.find_right_answers_of_student(
+            self.submitter_id
+        ) or self.key.find_right_answers_of_student(shorten_text(self.results.student.id))
 
     @cached_property
     def is_own_log(self) -> bool:
@@ -159,9 +159,9 @@ class ScoringInput:
         # accept the log of any student if the answer key does not contain this student
         is_other_log = assigned is not None and not self.is_own_log
         if self.right_answers is None or is_other_log:
-            file_text = format_reason(assigned.file if assigned else "")
+            assigned_log_text = format_reason(assigned.file if assigned else "")
             return (
-                f"this report is not about the log that you were given{file_text}. Make a "
+                f"this report is not about the log that you were given{assigned_log_text}. Make a "
                 "report of that log, with your --id"
             )
         if isinstance(self.form, str):
@@ -196,7 +196,7 @@ def find_values(values: Mapping[str, Any], path_pattern: str) -> list[tuple[str,
 
 
 def shorten_text(value: str) -> str:
-    return one_line(value, MAX_QUOTE_LENGTH)
+    return shorten_to_line(value, MAX_QUOTE_LENGTH)
 
 
 def format_reason(reason: str) -> str:
@@ -225,13 +225,13 @@ class NumberItem(RubricItem, tag="number"):
     Outside these bounds, the points decrease linearly to zero at the value ``zero_at``.
     """
 
-    path: Text
-    name: Text = ""
-    unit: Text = ""
+    path: OneLineText
+    name: OneLineText = ""
+    unit: OneLineText = ""
     at_least: Bound = -math.inf
     at_most: Bound = math.inf
     zero_at: Bound | None = None
-    advice: Text = ""
+    advice: OneLineText = ""
 
     def __post_init__(self) -> None:
         is_bounded = math.isfinite(self.at_least) or math.isfinite(self.at_most)
@@ -265,7 +265,7 @@ class NumberItem(RubricItem, tag="number"):
         label = self.name or f"the number {shorten_text(path)}"
         bounds = (("at least", self.at_least), ("at most", self.at_most))
         limit_texts = [f"{word} {bound:.4g}" for word, bound in bounds if math.isfinite(bound)]
-        statement = f"{capitalise_first(label)} is {f'{number:.4g} {self.unit}'.strip()}"
+        statement = f"{capitalise_first_letter(label)} is {f'{number:.4g} {self.unit}'.strip()}"
         advice = f" {self.advice}" if points_fraction < 1.0 and self.advice else ""
         return points_fraction, f"{statement}; required: {' and '.join(limit_texts)}.{advice}"
 
@@ -278,12 +278,12 @@ class AnswersItem(RubricItem, tag="answers"):
     def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
         points_or_reason = scoring_input.form_points
         if isinstance(points_or_reason, str):
-            return 0.0, f"{capitalise_first(points_or_reason)}."
+            return 0.0, f"{capitalise_first_letter(points_or_reason)}."
         points_text = ", ".join(
             f"{part.title} {part.points:.3g} of {part.max_points:g}"
             for part in points_or_reason.parts
         )
-        feedback = capitalise_first("; ".join(points_or_reason.feedback))
+        feedback = capitalise_first_letter("; ".join(points_or_reason.feedback))
         return points_or_reason.fraction, f"Points of 100: {points_text}. {feedback}."
 
 

@@ -14,8 +14,8 @@ from px4fuse.classroom.grading.model import (
     Grade,
     GradedReport,
     GradeOverride,
-    counted_reports,
     list_item_titles,
+    select_counted_reports,
 )
 from px4fuse.core.text import format_count
 from px4fuse.html import frame
@@ -73,7 +73,7 @@ def format_class_page(grades: Sequence[Grade], title: str, version_text: str) ->
 def _format_statistics(grades: Sequence[Grade], count_by_tag: Mapping[str, int]) -> str:
     """Format the statistics of the class: reports by status, and points of students and items."""
     totals = [grade.total for grade in grades if grade.total is not None]
-    reports = counted_reports(grades)
+    reports = select_counted_reports(grades)
     pending_points = [report.points for report in reports if report.instructor_action]
     # title, value and note; zeros are not shown
     numbers: list[tuple[str, float | str, str]] = [
@@ -84,10 +84,10 @@ def _format_statistics(grades: Sequence[Grade], count_by_tag: Mapping[str, int])
         ("Late", count_by_tag["late"], ""),
     ]
     if totals:
-        maximum_text = f"of {max(grade.max_points for grade in grades):g}"
+        max_points_text = f"of {max(grade.max_points for grade in grades):g}"
         numbers += [
-            ("Mean points", f"{statistics.fmean(totals):.1f}", maximum_text),
-            ("Median points", f"{statistics.median(totals):.1f}", maximum_text),
+            ("Mean points", f"{statistics.fmean(totals):.1f}", max_points_text),
+            ("Median points", f"{statistics.median(totals):.1f}", max_points_text),
         ]
     points_text = f"{format_cell_number(sum(pending_points))} points"
     numbers.append(("Pending items", len(pending_points), points_text))
@@ -275,11 +275,11 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
             scores_by_title[f"Fault: {kind}"].append((float(is_named), 1.0, report.points))
     statistics = []
     for title, scores in scores_by_title.items():
-        points, max_points, other_points = np.transpose(scores)
+        points, max_points, points_of_other_items = np.transpose(scores)
         discrimination = None
-        has_variation = np.ptp(points) > 0.0 and np.ptp(other_points) > 0.0
+        has_variation = np.ptp(points) > 0.0 and np.ptp(points_of_other_items) > 0.0
         if len(scores) >= MIN_REPORTS_FOR_CORRELATION and has_variation:
-            discrimination = float(np.corrcoef(points, other_points)[0, 1])
+            discrimination = float(np.corrcoef(points, points_of_other_items)[0, 1])
         statistics.append(
             ItemStatistics(title, float(points.mean()), float(max_points.max()), discrimination)
         )

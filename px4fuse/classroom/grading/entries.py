@@ -23,8 +23,8 @@ from px4fuse.classroom.assignment.roster import (
     format_cell_number,
     normalise_text,
     parse_decimal,
+    read_csv_sheet,
     read_people,
-    read_sheet,
 )
 from px4fuse.classroom.grading.model import (
     TOTAL_TITLE,
@@ -34,10 +34,10 @@ from px4fuse.classroom.grading.model import (
     GradeOverride,
     ItemScore,
     Submission,
-    counted_reports,
+    select_counted_reports,
 )
 from px4fuse.classroom.grading.rubric import Rubric, flag_equal_contents
-from px4fuse.core.text import clean_text, one_line
+from px4fuse.core.text import clean_text, shorten_to_line
 from px4fuse.errors import SettingsError
 
 TIME_FORMAT = "%Y-%m-%d %H:%M"
@@ -56,7 +56,7 @@ ENGLISH_MONTHS = {"mär": "mar", "mai": "may", "okt": "oct", "dez": "dec"}
 
 
 @dataclass(frozen=True)
-class LateRule:
+class LateDeductionRule:
     """Deduction of points for late submissions.
 
     Each started day or hour costs the fraction ``deduction_per_unit`` of the maximum points.
@@ -100,7 +100,7 @@ class Course:
         Report that counts if a student submitted several.
     due : datetime or None
         Due time of the submission.
-    grace_s : float
+    grace_period_s : float
         Maximum delay (s) without a deduction.
     scale : float or None
         Maximum points on the learning platform; None for the maximum of the rubric.
@@ -121,10 +121,10 @@ class Course:
     grade_column_title: str = ""
     attempt: Literal["latest", "best", "first"] = "latest"
     due: datetime | None = None
-    grace_s: float = 0.0
+    grace_period_s: float = 0.0
     scale: float | None = None
     question_count: int = 0
-    late_rule: LateRule | None = None
+    late_rule: LateDeductionRule | None = None
     include_pending: bool = False
     anonymous: bool = False
 
@@ -138,7 +138,7 @@ class Course:
         return ClassList(people, *people_by_sheet)
 
 
-class _Candidate(NamedTuple):
+class _CandidateReport(NamedTuple):
     """Report that may count for a student's grade.
 
     Attributes
@@ -176,7 +176,7 @@ def build_grades(
     """
     grades = _choose_reports(reports, submissions, course)
     overrides_per_grade, notes = match_overrides(overrides, grades)
-    flags_by_submission = flag_equal_contents(counted_reports(grades))
+    flags_by_submission = flag_equal_contents(select_counted_reports(grades))
     grades_with_report = [grade for grade in grades if grade.counted_report]
     unknown_time_count = sum(grade.lateness_s is None for grade in grades_with_report)
     if course.late_rule and unknown_time_count:
@@ -185,8 +185,8 @@ def build_grades(
             "students, so no points were deducted. Add the times with --worksheet."
         )
     final_grades = (
-        _apply_overrides(grade, override_by_title, flags_by_submission, course)
-        for grade, override_by_title in zip(grades, overrides_per_grade, strict=True)
+        _apply_overrides(grade, override_by_item_title, flags_by_submission, course)
+        for grade, override_by_item_title in zip(grades, overrides_per_grade, strict=True)
     )
     return tuple(final_grades), tuple(notes)
 
@@ -202,7 +202,7 @@ def _choose_reports(
     if not class_list.people:
         class_list = _collect_students(reports, submissions)
         unknown_student_flag = "Neither the report nor the learning platform names a student."
-    candidates_by_student_index: dict[int, list[_Candidate]] = defaultdict(list)
+    candidates_by_student_index: dict[int, list[_CandidateReport]] = defaultdict(list)
     grades_of_unknown_students = []
     for report, submission in zip(reports, submissions, strict=True):
         student_index = class_list.find_student_index(submission.origin.person)
@@ -242,10 +242,12 @@ def _collect_students(
                 name = report.student.strip() or name
             else:  # do not use the report: it has no id, or that of another student
                 student_id = person.login or " ".join(person.numbers.values())
-            person = replace(person, student_id=student_id, name=one_line(name, 200))
+            person = replace(person, student_id=student_id, name=shorten_to_line(name, 200))
             class_list.people.append(person)
         elif report.student_id and reported_student_index is None:
-            class_list.people.append(Person(report.student_id, one_line(report.student, 200)))
+            class_list.people.append(
+                Person(report.student_id, shorten_to_line(report.student, 200))
+            )
     return class_list
 
 
@@ -255,7 +257,7 @@ def _make_candidate(
     course: Course,
     student_index: int | None,
     class_list: ClassList,
-) -> _Candidate:
+) -> _CandidateReport:
     """Return a report with its submission time, and the grade that it gives to the student.
 
     The grade applies only if the report is chosen from all reports of the student.
@@ -266,7 +268,7 @@ def _make_candidate(
     )
     due_time = course.due
     if due_time is not None and person.extended_due:
-        name = f"extension of {one_line(person.student_id, 40)}:"
+        name = f"extension of {shorten_to_line(person.student_id, 40)}:"
         due_time = parse_due_time(person.extended_due, name, due_time.tzinfo)
     submission_time = origin.time or parse_moodle_time(person.submission_time)
     if submission_time is not None:
@@ -275,11 +277,11 @@ def _make_candidate(
     if due_time is not None and submission_time is not None:
         # UNIX times, because differences of datetime objects ignore daylight saving time
         lateness_s = submission_time.timestamp() - due_time.timestamp()
-        lateness_s = lateness_s if lateness_s > course.grace_s else 0.0
+        lateness_s = lateness_s if lateness_s > course.grace_period_s else 0.0
         if course.late_rule is not None:
             deducted_points = course.late_rule.compute_deduction(lateness_s, report.max_points)
     grade = Grade(
-        person.name or one_line(report.student or origin.person.name, 200),
+        person.name or shorten_to_line(report.student or origin.person.name, 200),
         person.student_id,
         report,
         submission_time=f"{submission_time:{TIME_FORMAT}}" if submission_time else "",
@@ -289,7 +291,7 @@ def _make_candidate(
         flags=tuple(_flag_submission(report, origin, lateness_s, student_index, class_list)),
     )
     time_s = submission_time.timestamp() if submission_time else 0.0
-    return _Candidate(time_s, report, grade)
+    return _CandidateReport(time_s, report, grade)
 
 
 def _flag_submission(
@@ -324,15 +326,15 @@ def _flag_submission(
         )
 
 
-def _choose_counted_report(candidates: Sequence[_Candidate], course: Course) -> Grade:
+def _choose_counted_report(candidates: Sequence[_CandidateReport], course: Course) -> Grade:
     """Choose the report that counts for a student's grade."""
     candidates = sorted(candidates, key=lambda each: each.time_s)
     # prefer reports without open decisions of the instructor
     readable = [each for each in candidates if each.report.version]
     final = [each for each in readable if not each.report.instructor_action]
-    eligible = final or readable or candidates
+    eligible_candidates = final or readable or candidates
 
-    def rank(candidate: _Candidate) -> tuple[float, float, str]:
+    def rank(candidate: _CandidateReport) -> tuple[float, float, str]:
         points = max(candidate.report.points - candidate.grade.deducted_points, 0.0)
         time_s = candidate.time_s
         criteria = {
@@ -343,7 +345,7 @@ def _choose_counted_report(candidates: Sequence[_Candidate], course: Course) -> 
         # the name decides between reports with equal time and points
         return (*criteria[course.attempt], candidate.report.submission)
 
-    chosen = max(eligible, key=rank)
+    chosen = max(eligible_candidates, key=rank)
     report, flags = chosen.report, list(chosen.grade.flags)
     # without this rule, students could hand in several answer forms with different guesses
     if course.attempt == "best":
@@ -352,7 +354,7 @@ def _choose_counted_report(candidates: Sequence[_Candidate], course: Course) -> 
                 f"The student handed in {len(candidates)} reports with different answer forms."
             )
     else:
-        forms = [each.report.form for each in eligible if each.time_s == chosen.time_s]
+        forms = [each.report.form for each in eligible_candidates if each.time_s == chosen.time_s]
         if len(set(forms)) > 1:
             action = (
                 f"The answer forms of {len(forms)} reports differ. Ask the student which report "
@@ -364,7 +366,7 @@ def _choose_counted_report(candidates: Sequence[_Candidate], course: Course) -> 
         is_report = bool(other.report.version)
         if other.time_s >= chosen.time_s and (other.report.instructor_action or not is_report):
             status = "pending" if is_report else "not a report"
-            name = one_line(other.report.submission, 80)
+            name = shorten_to_line(other.report.submission, 80)
             flags.append(f"The file {name} does not count for the grade: it is {status}.")
     return replace(
         chosen.grade,
@@ -376,7 +378,7 @@ def _choose_counted_report(candidates: Sequence[_Candidate], course: Course) -> 
 
 def _apply_overrides(
     grade: Grade,
-    override_by_title: Mapping[str, GradeOverride],
+    override_by_item_title: Mapping[str, GradeOverride],
     flags_by_submission: Mapping[str, Sequence[str]],
     course: Course,
 ) -> Grade:
@@ -384,19 +386,20 @@ def _apply_overrides(
     report, total_points, flags = grade.counted_report, None, grade.flags
     if report is not None:
         items = (
-            _apply_item_override(item, override_by_title.get(item.title)) for item in report.items
+            _apply_item_override(item, override_by_item_title.get(item.title))
+            for item in report.items
         )
         report = replace(report, items=tuple(items))
         flags = (*flags, *report.flags, *flags_by_submission.get(report.submission, ()))
         # without include_pending, points with an open decision of the instructor do not count
         if report.counted_points is not None or course.include_pending:
             total_points = round(max(report.points - grade.deducted_points, 0.0), 2)
-    report_override = override_by_title.get("", GradeOverride())
-    total_override = override_by_title.get(TOTAL_TITLE, GradeOverride())
+    report_override = override_by_item_title.get("", GradeOverride())
+    total_override = override_by_item_title.get(TOTAL_TITLE, GradeOverride())
     return replace(
         grade,
         counted_report=report,
-        overrides=override_by_title,
+        overrides=override_by_item_title,
         comment="\n".join(filter(None, (report_override.comment, total_override.comment))),
         total=total_points if total_override.points is None else total_override.points,
         flags=flags,
@@ -432,7 +435,7 @@ def read_overrides(path: Path) -> OverridesByStudent:
     """
     if not path.exists():
         return {}
-    sheet = read_sheet(path)
+    sheet = read_csv_sheet(path)
     missing_titles = [
         title for title in OVERRIDE_TITLES if sheet.find_column_index((title,)) is None
     ]
@@ -454,10 +457,14 @@ def read_overrides(path: Path) -> OverridesByStudent:
         parsed_points = parse_decimal(points)
         problem = ""
         if item_title in overrides[student]:
-            item_text = one_line(item_title, 40) or "(whole report)"
-            problem = f"student {one_line(student, 40)} has two rows for the item {item_text}"
+            item_text = shorten_to_line(item_title, 40) or "(whole report)"
+            problem = (
+                f"student {shorten_to_line(student, 40)} has two rows for the item {item_text}"
+            )
         elif points and (parsed_points is None or parsed_points < 0.0):
-            problem = f"the points must be a number of 0 or more, not {one_line(points, 20)!r}"
+            problem = (
+                f"the points must be a number of 0 or more, not {shorten_to_line(points, 20)!r}"
+            )
         elif points and not item_title:
             problem = "the row has points but no item: write a rubric title or 'total' as item"
         if problem:
@@ -488,11 +495,11 @@ def match_overrides(
     for student, override_by_item in overrides.items():
         # the instructor may type an id or a file name
         student_index = class_list.find_student_index(Person(student, login=student))
-        student_text = one_line(student, 40) or "(empty)"
+        student_text = shorten_to_line(student, 40) or "(empty)"
         if student_index is None:
             notes.append(f"{OVERRIDES_NAME}: no student has the id {student_text}.")
             continue
-        override_by_title = matched_overrides[student_index]
+        override_by_item_title = matched_overrides[student_index]
         max_points_by_title = {TOTAL_TITLE: max_total_points, "": math.inf}
         if report := grades[student_index].counted_report:
             max_points_by_title[TOTAL_TITLE] = report.max_points
@@ -502,23 +509,23 @@ def match_overrides(
             title = title_by_normalised_title.get(normalise_text(item_title), item_title)
             max_points, problem = max_points_by_title.get(title), ""
             if max_points is None:
-                problem = f"student {student_text} has no item {one_line(item_title, 60)!r}"
-            elif title in override_by_title:
+                problem = f"student {student_text} has no item {shorten_to_line(item_title, 60)!r}"
+            elif title in override_by_item_title:
                 problem = f"student {student_text} has two rows for {title or 'the whole report'!r}"
             elif (override.points or 0.0) > max_points:
-                limit_text = f"{max_points:g} points of {one_line(title, 60)!r}"
+                limit_text = f"{max_points:g} points of {shorten_to_line(title, 60)!r}"
                 problem = f"points of student {student_text} are above the maximum, {limit_text}"
             if problem:
                 notes.append(f"{OVERRIDES_NAME}: {problem}.")
             else:
-                override_by_title[title] = override
+                override_by_item_title[title] = override
     return matched_overrides, notes
 
 
 # ------------------------------------------------------------------ due time
 
 
-def parse_late_rule(text: str) -> LateRule:
+def parse_late_rule(text: str) -> LateDeductionRule:
     """Parse a rule for late submissions such as ``10%/day`` or ``10%/day up to 50%``.
 
     Raises
@@ -534,7 +541,7 @@ def parse_late_rule(text: str) -> LateRule:
     deduction_text, unit, limit_text = match.groups()
     unit_s = 86_400.0 if unit == "day" else 3_600.0
     max_deduction_fraction = min(float(limit_text or 100.0) / 100.0, 1.0)
-    return LateRule(float(deduction_text) / 100.0, unit_s, max_deduction_fraction)
+    return LateDeductionRule(float(deduction_text) / 100.0, unit_s, max_deduction_fraction)
 
 
 def parse_due_time(

@@ -30,7 +30,7 @@ POINTS_FRACTION_OF_FLIGHT_QUESTIONS = 0.2
 # Points deducted for each false fault
 FALSE_FAULT_DEDUCTION = 10.0
 # With this number of false faults or more (guesses), right faults give no points either
-ZERO_POINTS_FALSE_FAULT_COUNT = 3
+MIN_FALSE_FAULTS_FOR_ZERO_POINTS = 3
 # Score for the answer that names a fault similar to the injected fault
 SCORE_FOR_SIMILAR_FAULT = 0.4
 # Score of a student who names a wrong EKF2_EVP_NOISE, although the injected fault is a wrong
@@ -70,14 +70,14 @@ class CorrectionRule(Record):
     score : float
         Fraction of the points: 1 if the parameter corrects the fault, 1/2 if it concerns the fault
         but does not correct it, and 1/3 if it only hides the fault.
-    right_values : str
+    right_value_range : str
         "LOW to HIGH", or the name of a computed range; "" if any value is right.
     """
 
     parameter: str
     fault_kinds: str
     score: float
-    right_values: str
+    right_value_range: str
 
 
 CORRECTION_RULES = read_csv(__file__, CorrectionRule, "corrections.csv")
@@ -122,7 +122,7 @@ def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> 
     matches, wrongly_named_faults = _match_faults(answers, right_answers)
     if is_recognised_as_fault_free:
         scores["mistakes"] = 1.0
-    elif len(wrongly_named_faults) < ZERO_POINTS_FALSE_FAULT_COUNT:
+    elif len(wrongly_named_faults) < MIN_FALSE_FAULTS_FOR_ZERO_POINTS:
         scores |= _score_faults(matches, right_answers)
     scores["numbers"] = _score_numbers(answers, right_answers)
     scores["verdicts"] = _score_verdicts(answers, right_answers)
@@ -285,7 +285,7 @@ def _score_faults(matches: list[FaultMatch], right_answers: CorrectFormAnswers) 
         if named_fault is None:
             continue
         size_score = score_fault_size(fault, named_fault)
-        # time, plot and correction of a guessable fault are easy: they need the right size
+        # time, plot and correction of a guessable fault are easy: they need the correct size
         fault_weight = (size_score if fault.kind in GUESSABLE_FAULT_KINDS else 1.0) / len(matches)
         # time and plot of a similar fault give half of the points
         evidence_weight = fault_weight if named_fault.kind == fault.kind else 0.5 * fault_weight
@@ -302,7 +302,7 @@ def score_fault_size(fault: InjectedFault, named_fault: NamedFault) -> float:
     if fault.size is None or fault.low is None or fault.high is None or stated_size is None:
         return 0.0
     if named_fault.kind != fault.kind:
-        # the right size of a similar fault, such as a time offset, gives a third of the points
+        # the correct size of a similar fault, such as a time offset, gives a third of the points
         unit, named_unit = (FAULT_KINDS[each.kind].standard_unit for each in (fault, named_fault))
         return (fault.low <= stated_size <= fault.high and unit == named_unit) / 3.0
     relative_error = abs(stated_size - fault.size) / abs(fault.size)
@@ -377,7 +377,7 @@ def find_accepted_corrections(
     size, lower_bound, upper_bound = (value or 0.0 for value in (fault.size, fault.low, fault.high))
     fault_start_s = fault.from_s or 0.0
     fault_end_s = fault_start_s if fault.until_s is None else fault.until_s
-    # ranges that the column right_values of corrections.csv names
+    # ranges that the column right_value_range of corrections.csv names
     range_by_name = {
         "": NO_BOUNDS,
         "negated": (-upper_bound, -lower_bound),
@@ -396,12 +396,12 @@ def find_accepted_corrections(
     accepted_corrections = []
     for rule in CORRECTION_RULES:
         # EKF2_EV_DELAY cannot be negative, so it does not correct timestamps that are too early
-        is_possible = size > 0.0 or rule.right_values != "late milliseconds"
+        is_possible = size > 0.0 or rule.right_value_range != "late milliseconds"
         if fault.kind in rule.fault_kinds.split() and is_possible:
-            if rule.right_values in range_by_name:
-                low, high = range_by_name[rule.right_values]
+            if rule.right_value_range in range_by_name:
+                low, high = range_by_name[rule.right_value_range]
             else:
-                low, high = map(float, rule.right_values.split(" to "))
+                low, high = map(float, rule.right_value_range.split(" to "))
             accepted_corrections.append((rule.parameter, (low, high), rule.score))
     return accepted_corrections
 

@@ -23,7 +23,7 @@ from px4fuse.classroom.grading.outputs import (
 )
 from px4fuse.classroom.grading.rubric import Rubric, grade_unreadable_file, score_report
 from px4fuse.core.reading import hash_files, max_log_bytes
-from px4fuse.core.text import one_line
+from px4fuse.core.text import shorten_to_line
 from px4fuse.core.workers import JobFailure, run_with_limits
 from px4fuse.core.writing import write_output_files
 from px4fuse.errors import ResultsError
@@ -97,7 +97,7 @@ def grade(
     for worksheet in course.worksheets:
         find_grade_column(worksheet, course.grade_column_title)
     unread_file_notes = [
-        f"{one_line(file.name, 80)} was ignored: px4fuse reads only {OVERRIDES_NAME}."
+        f"{shorten_to_line(file.name, 80)} was ignored: px4fuse reads only {OVERRIDES_NAME}."
         for file in sorted(output.glob("overrides*"))
         if file.name != OVERRIDES_NAME
     ]
@@ -254,7 +254,7 @@ def load_or_verify(
     # verify() returns "cannot verify" instead of "other log", which would be the student's fault
     is_log_missing = versions_and_files.get(log_sha256(results)) == "assigned"
     verification = verify(results, pdf, {} if is_log_missing else path_by_sha256)
-    files = {REDRAWN_REPORT_SUFFIX: verification.redrawn_pdf}
+    files = {REDRAWN_REPORT_SUFFIX: verification.redrawn_pdf} if verification.redrawn_pdf else {}
     if verification.status == "verified" and log_sha256(results) in assigned_hashes:
         results, files[DIAGNOSIS_SUFFIX] = repeat_analysis_with_diagnosis(results, path_by_sha256)
     verification = replace(verification, redrawn_pdf=b"")
@@ -265,7 +265,7 @@ def load_or_verify(
     for suffix in (REDRAWN_REPORT_SUFFIX, DIAGNOSIS_SUFFIX):
         record_path.with_suffix(suffix).unlink(missing_ok=True)
     write_output_files(
-        {record_path.with_suffix(suffix): content for suffix, content in files.items() if content}
+        {record_path.with_suffix(suffix): content for suffix, content in files.items()}
     )
     return results, verification, False
 

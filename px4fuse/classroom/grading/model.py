@@ -40,7 +40,7 @@ class ExportOrigin:
     has_forged_platform_name: bool = False
 
 
-UNKNOWN_ORIGIN = ExportOrigin()
+UNKNOWN_EXPORT_ORIGIN = ExportOrigin()
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Submission:
     file: Path
     zip_entry: str
     name: str
-    origin: ExportOrigin = UNKNOWN_ORIGIN
+    origin: ExportOrigin = UNKNOWN_EXPORT_ORIGIN
 
 
 @dataclass(frozen=True)
@@ -212,11 +212,11 @@ class Grade:
         return self.student or self.student_id or "no name"
 
 
-def counted_reports(grades: Sequence[Grade]) -> list[GradedReport]:
+def select_counted_reports(grades: Sequence[Grade]) -> list[GradedReport]:
     return [report for grade in grades if (report := grade.counted_report)]
 
 
 def list_item_titles(grades: Sequence[Grade]) -> list[str]:
     """Return the titles of all rubric items that score a report."""
-    items = (item for report in counted_reports(grades) for item in report.items)
+    items = (item for report in select_counted_reports(grades) for item in report.items)
     return [*dict.fromkeys(item.title for item in items)]

@@ -10,7 +10,7 @@ from px4fuse.classroom.grading.form_points import (
     list_answered_choices,
 )
 from px4fuse.classroom.grading.model import Grade
-from px4fuse.core.text import one_line
+from px4fuse.core.text import shorten_to_line
 from px4fuse.results.answer_form import FAULT_KINDS, NO_FAULT_KIND, REPORT_PANELS, Answers
 
 # Question to the student, and expected answer
@@ -25,7 +25,7 @@ def format_questions(grades: Sequence[Grade], key: AnswerKey, count: int) -> str
         answer = key.find_answers_by_log_sha256(report.log_sha256) if report else None
         if report is None or report.form is None or answer is None or answer.form is None:
             continue
-        lines += ["", one_line(f"{grade.display_name} {grade.student_id}", 100)]
+        lines += ["", shorten_to_line(f"{grade.display_name} {grade.student_id}", 100)]
         questions = [*ask_about_form(report.form, answer.form)][:count]
         for number, (question, expected) in enumerate(questions, start=1):
             for prefix, text in ((f"{number}. ", question), ("   Expected: ", expected)):

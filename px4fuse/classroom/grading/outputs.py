@@ -26,7 +26,7 @@ from px4fuse.classroom.assignment.roster import (
     make_unique,
     normalise_text,
     parse_decimal,
-    read_sheet,
+    read_csv_sheet,
     read_student,
 )
 from px4fuse.classroom.grading.checks import shorten_text
@@ -36,12 +36,12 @@ from px4fuse.classroom.grading.model import (
     TOTAL_TITLE,
     Grade,
     GradedReport,
-    counted_reports,
     list_item_titles,
+    select_counted_reports,
 )
 from px4fuse.classroom.grading.oral_check import format_questions
-from px4fuse.core.input_files import suspend_input_registration
-from px4fuse.core.text import clean_text, join_first_names, neutralise_formulas, one_line
+from px4fuse.core.input_files import protect_inputs
+from px4fuse.core.text import clean_text, join_first_names, neutralise_formulas, shorten_to_line
 from px4fuse.core.writing import write_output_files
 from px4fuse.errors import SettingsError
 from px4fuse.verification.model import Verification
@@ -125,7 +125,7 @@ def write_grading_files(
         for grade, stem in zip(grades, file_stems, strict=True)
     ]
     has_redrawn_reports = any(
-        report.redrawn_report_path for report in counted_reports(class_page_grades)
+        report.redrawn_report_path for report in select_counted_reports(class_page_grades)
     )
     feedback_texts = [feedback_text(grade, class_title) for grade in grades]
     texts = {"class.csv": format_class_table(grades)}
@@ -192,8 +192,8 @@ def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade],
     """
     pseudonym_by_identity: dict[str, str] = {}
     if path.exists():
-        with suspend_input_registration():
-            sheet = read_sheet(path)
+        with protect_inputs(is_active=False):
+            sheet = read_csv_sheet(path)
         for row in sheet.rows:
             pseudonym, identity, _ = (
                 sheet.find_cell(row, (title,)).removeprefix("'") for title in PSEUDONYM_TITLES
@@ -201,8 +201,8 @@ def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade],
             pseudonym_by_identity[identity] = pseudonym
     name_by_identity = {_identify_student(grade): grade.student for grade in grades}
     new_identities = name_by_identity.keys() - pseudonym_by_identity.keys()
-    all_numbers = range(1, len(new_identities) + len(pseudonym_by_identity) + 1)
-    all_pseudonyms = {f"Student {number:03}" for number in all_numbers}
+    pseudonym_numbers = range(1, len(new_identities) + len(pseudonym_by_identity) + 1)
+    all_pseudonyms = {f"Student {number:03}" for number in pseudonym_numbers}
     free_pseudonyms = [*(all_pseudonyms - {*pseudonym_by_identity.values()})]
     random.SystemRandom().shuffle(free_pseudonyms)
     pseudonym_by_identity |= zip(new_identities, free_pseudonyms, strict=False)
@@ -251,10 +251,10 @@ def anonymise_grade(grade: Grade, pseudonym: str) -> Grade:
 def format_class_table(grades: Sequence[Grade]) -> str:
     """Format a table with one row per student as CSV for Excel and LibreOffice."""
     item_titles = list_item_titles(grades)
-    number_titles = dict.fromkeys(
-        title for report in counted_reports(grades) for title in report.numbers
+    numeric_column_titles = dict.fromkeys(
+        title for report in select_counted_reports(grades) for title in report.numbers
     )
-    titles = (*TITLES_BEFORE_ITEMS, *item_titles, *number_titles, *TITLES_AFTER_ITEMS)
+    titles = (*TITLES_BEFORE_ITEMS, *item_titles, *numeric_column_titles, *TITLES_AFTER_ITEMS)
     rows = []
     for grade in grades:
         report = grade.counted_report
@@ -270,7 +270,7 @@ def format_class_table(grades: Sequence[Grade]) -> str:
             grade.deducted_points or None,
             grade.total,
             *map(points_by_title.get, item_titles),
-            *(report.numbers.get(title) if report else None for title in number_titles),
+            *(report.numbers.get(title) if report else None for title in numeric_column_titles),
             grade.submission_time,
             None if grade.lateness_s is None else grade.lateness_s / 3600.0,
             report.pending_actions if report else "",
@@ -389,18 +389,18 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
     titles = sheet.column_titles
     short_titles = [_ASSIGNMENT_NUMBER_PATTERN.sub("", title) for title in titles]
     # Canvas marks the columns that it computes in one of the first rows
-    editable_indices = [
+    editable_column_indices = [
         index
         for index in range(len(titles))
         if not any(READ_ONLY_TEXT in row[index] for row in sheet.rows[:3])
     ]
     # Canvas adds the number of the assignment to the title of its column
-    assignment_indices = [
-        index for index in editable_indices if short_titles[index] != titles[index]
+    assignment_column_indices = [
+        index for index in editable_column_indices if short_titles[index] != titles[index]
     ]
     matching_indices = [
         index
-        for index in editable_indices
+        for index in editable_column_indices
         if normalise_text(column_title) in map(normalise_text, (titles[index], short_titles[index]))
     ]
     # a table of Moodle (with a column "identifier") has only one grade column, so a --column that
@@ -412,14 +412,15 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
     elif grade_column_index is not None:
         candidate_indices = [grade_column_index]
     else:
-        candidate_indices = assignment_indices
+        candidate_indices = assignment_column_indices
     if len(candidate_indices) == 1:
         return candidate_indices[0]
     problem = "several grade columns" if candidate_indices else "no grade column was found"
     listed_titles = ", ".join(
-        one_line(short_titles[index], 40) for index in assignment_indices or editable_indices
+        shorten_to_line(short_titles[index], 40)
+        for index in assignment_column_indices or editable_column_indices
     )
-    remedy = f"Choose the grade column with --column: {one_line(listed_titles, 300)}."
+    remedy = f"Choose the grade column with --column: {shorten_to_line(listed_titles, 300)}."
     raise SettingsError(f"{sheet.path}: {problem}.", remedy)
 
 
@@ -461,7 +462,7 @@ def fill_grades(
         else escape_html
     )
     cells_by_row = [list(row) for row in sheet.rows]
-    names = [one_line(grade.student or grade.student_id, 40) for grade in grades]
+    names = [shorten_to_line(grade.student or grade.student_id, 40) for grade in grades]
     has_decimal_comma = any(
         re.fullmatch(r"\d+,\d+", cell.strip()) for row in cells_by_row for cell in row
     )

@@ -23,9 +23,9 @@ from px4fuse.classroom.assignment.key import AnswerKey
 from px4fuse.classroom.assignment.roster import make_unique, normalise_text
 from px4fuse.classroom.grading.checks import (
     FORM_MISMATCH_REASON,
+    OneLineText,
     RubricItem,
     ScoringInput,
-    Text,
     format_reason,
     shorten_text,
 )
@@ -33,7 +33,7 @@ from px4fuse.classroom.grading.form_points import FormPoints
 from px4fuse.classroom.grading.model import TOTAL_TITLE, GradedReport, ItemScore
 from px4fuse.core.reading import read_text
 from px4fuse.core.record import Record
-from px4fuse.core.text import capitalise_first, join_first_names, one_line
+from px4fuse.core.text import capitalise_first_letter, join_first_names, shorten_to_line
 from px4fuse.errors import SettingsError
 from px4fuse.request import LoopRequest
 from px4fuse.results.answer_form import Answers, NumericAnswer
@@ -92,7 +92,7 @@ class Rubric(Record, kw_only=True):
         Rule for a report with verified numbers, but changed pages.
     """
 
-    title: Text = ""
+    title: OneLineText = ""
     unverified: Literal["pending", "zero"] = "pending"
     others_log: ReportPointsRule = "pending"
     pages: ReportPointsRule = "count"
@@ -109,7 +109,7 @@ class Rubric(Record, kw_only=True):
                 )
 
 
-def rubric_text() -> str:
+def read_default_rubric_text() -> str:
     return DEFAULT_RUBRIC.read_text("utf-8")
 
 
@@ -131,7 +131,9 @@ def parse_rubric(text: str, source_name: str) -> Rubric:
     # tomllib raises ValueError for a syntax error, and for an integer with very many digits
     except (msgspec.ValidationError, ValueError, RecursionError) as error:
         message = re.sub(r"`\$\.item\[(\d+)\]\.?([^`]*)`", _format_item_and_field, str(error))
-        raise SettingsError(f"{source_name}: {one_line(message, 300)}", RUBRIC_HELP) from error
+        raise SettingsError(
+            f"{source_name}: {shorten_to_line(message, 300)}", RUBRIC_HELP
+        ) from error
 
 
 def _format_item_and_field(path: re.Match[str]) -> str:
@@ -212,7 +214,7 @@ def _flag_report(scoring_input: ScoringInput) -> Iterator[str]:
     if page_differences:
         yield (
             "The PDF differs from the report that px4fuse recomputed from the log. "
-            f"{capitalise_first(page_differences[0].sentence)}."
+            f"{capitalise_first_letter(page_differences[0].sentence)}."
         )
     yield from flag_settings(scoring_input.results)
     if not scoring_input.is_own_log:
@@ -330,14 +332,14 @@ def _flag_drift(request: LoopRequest) -> Iterator[str]:
 
 def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequence[str]]:
     """Return sentences about reports with equal contents, by name of the submitted file."""
-    names_by_flag: dict[tuple[str, str], list[str]] = defaultdict(list)
+    other_report_names_by_flag: dict[tuple[str, str], list[str]] = defaultdict(list)
     for report, other_report in combinations(reports, 2):
         for sentence in _find_equal_contents(report, other_report):
             for flagged, other in ((report, other_report), (other_report, report)):
-                name = f"{_format_student(other)} ({one_line(other.submission, 80)})"
-                names_by_flag[flagged.submission, sentence].append(name)
+                name = f"{_format_student(other)} ({shorten_to_line(other.submission, 80)})"
+                other_report_names_by_flag[flagged.submission, sentence].append(name)
     flags_by_submission: dict[str, list[str]] = defaultdict(list)
-    for (submission, sentence), names in names_by_flag.items():
+    for (submission, sentence), names in other_report_names_by_flag.items():
         names_text = join_first_names(names, MAX_LISTED_REPORTS, "; ")
         flags_by_submission[submission].append(sentence.format(names_text))
     return flags_by_submission
@@ -405,4 +407,4 @@ def _identify_student(report: GradedReport) -> str:
 
 def _format_student(report: GradedReport) -> str:
     names = filter(None, (report.student.strip(), report.student_id.strip()))
-    return one_line(", ".join(names) or report.submission, 80)
+    return shorten_to_line(", ".join(names) or report.submission, 80)

@@ -34,11 +34,11 @@ from pathlib import Path
 from typing import IO
 
 from px4fuse.classroom.assignment.roster import Person, make_unique
-from px4fuse.classroom.grading.model import UNKNOWN_ORIGIN, ExportOrigin, Submission
-from px4fuse.core.input_files import add_input
+from px4fuse.classroom.grading.model import UNKNOWN_EXPORT_ORIGIN, ExportOrigin, Submission
+from px4fuse.core.input_files import register_input_path
 from px4fuse.core.reading import list_files_recursively
 from px4fuse.core.record import read_toml
-from px4fuse.core.text import clean_text, join_first_names, one_line
+from px4fuse.core.text import clean_text, join_first_names, shorten_to_line
 from px4fuse.errors import ResultsError, SettingsError
 from px4fuse.verification.model import BAD_VALUE_ERRORS
 from px4fuse.verification.pdf_input import MAX_PDF_BYTES
@@ -59,7 +59,7 @@ _ENCRYPTED_FLAG = 1
 _UTF8_FLAG = 0x800
 # Maximum number of ignored files that a note names
 MAX_LISTED_FILES = 5
-GRADESCOPE_METADATA = "submission_metadata.yml"
+GRADESCOPE_METADATA_FILE = "submission_metadata.yml"
 # Pattern of the file paths in an export, by learning platform
 PATH_PATTERN_BY_PLATFORM = {
     name: re.compile(pattern)
@@ -119,7 +119,7 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
         for submission in (_list_zip_submissions if is_zip else _list_folder_submissions)(
             path, notes
         ):
-            add_input(submission.file)
+            register_input_path(submission.file)
             suffix = submission.name.lower()[-4:]
             if suffix in (".pdf", ".zip"):
                 submission_by_path.setdefault((submission.file, submission.zip_entry), submission)
@@ -141,7 +141,7 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
             f"Zip files not opened: {zip_count}. Name each exported zip file on the command line."
         )
     if not submission_by_path:
-        raise SettingsError(one_line(" ".join(["No PDF found.", *notes]), 500))
+        raise SettingsError(shorten_to_line(" ".join(["No PDF found.", *notes]), 500))
     submissions = sorted(
         submission_by_path.values(),
         key=lambda each: (each.name.casefold(), each.name, each.file, each.zip_entry),
@@ -199,7 +199,7 @@ def read_submission(submission: Submission) -> bytes:
         if len(content) > MAX_PDF_BYTES:
             raise _EntryError(_TOO_LARGE_REASON)
     except _UNREADABLE_FILE_ERRORS as error:
-        name = one_line(submission.name, MAX_NAME_LENGTH)
+        name = shorten_to_line(submission.name, MAX_NAME_LENGTH)
         raise ResultsError(f"{name}: {_format_unread_reason(error)}") from error
     return content
 
@@ -207,7 +207,7 @@ def read_submission(submission: Submission) -> bytes:
 def _is_gradescope_metadata(name: str) -> bool:
     *folders, file = name.split("/")
     is_in_submission_folder = any(folder.startswith("submission_") for folder in folders)
-    return file == GRADESCOPE_METADATA and not is_in_submission_folder
+    return file == GRADESCOPE_METADATA_FILE and not is_in_submission_folder
 
 
 class _BlockLimitedFile:
@@ -267,9 +267,11 @@ def _list_folder_submissions(path: Path, notes: list[str]) -> Iterator[Submissio
         yield Submission(path.resolve(), "", path.name)
         return
     if not path.is_dir():
-        raise SettingsError(f"{one_line(str(path), MAX_NAME_LENGTH)} is not a file or folder.")
+        raise SettingsError(
+            f"{shorten_to_line(str(path), MAX_NAME_LENGTH)} is not a file or folder."
+        )
     root = path.resolve()
-    ignored_count = 0
+    ignored_entry_count = 0
     for file in list_files_recursively(root):  # symbolic links to folders are not entered
         name = file.relative_to(root)
         if any(map(_is_hidden, name.parts)):
@@ -282,11 +284,12 @@ def _list_folder_submissions(path: Path, notes: list[str]) -> Iterator[Submissio
             is_inside = False
         if is_inside:
             yield Submission(resolved_path, "", name.as_posix())
-        ignored_count += not is_inside
-    if ignored_count:
+        ignored_entry_count += not is_inside
+    if ignored_entry_count:
         notes.append(
-            f"{one_line(path.name, MAX_NAME_LENGTH)}: {ignored_count} entries were ignored (links "
-            "to files outside the folder, special files, unreadable folders)."
+            f"{shorten_to_line(path.name, MAX_NAME_LENGTH)}: {ignored_entry_count} entries were "
+            "ignored "
+            "(links to files outside the folder, special files, unreadable folders)."
         )
 
 
@@ -372,7 +375,7 @@ def parse_submission_path(
             bool(fields.get("late")),
             len(_PLATFORM_TEXT_PATTERN.findall(name)) > platform_text_count,
         )
-    return UNKNOWN_ORIGIN
+    return UNKNOWN_EXPORT_ORIGIN
 
 
 def _match_platforms(name: str, platforms: Iterable[str]) -> Iterator[tuple[str, re.Match[str]]]:

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array, IntArray
-from px4fuse.core.record import Count, NotNegative, Record, Share
+from px4fuse.core.record import Count, NonNegativeFloat, Record, Share
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie, model
 
@@ -33,7 +33,7 @@ class GateResult(Record):
 
     first: int
     second: int
-    d2: NotNegative
+    d2: NonNegativeFloat
     degrees_of_freedom: Count
     p: Share
     accepted: bool
@@ -72,10 +72,12 @@ def gate_edges(graph: model.PoseGraph, tested_edge_indices: IntArray) -> list[Ga
         lie.adjoint(poses[1:]), _compute_covariances(graph, connecting_edges)
     )
     cumulative_covariance = np.insert(np.cumsum(odometry_step_covariances, axis=0), 0, 0.0, axis=0)
+    # The covariance of the motion between both poses of a closure is the difference of two sums
     nodes -= first_pose_index
     odometry_chain_covariance = (
         cumulative_covariance[nodes.max(axis=0)] - cumulative_covariance[nodes.min(axis=0)]
     )
+    # Convert it to the axes of the second pose, then to the residual of the closure
     first_poses, second_poses = poses[nodes]
     covariance = _propagate_covariances(
         lie.adjoint(lie.inverse(second_poses)), odometry_chain_covariance

@@ -18,8 +18,8 @@ from px4fuse.trajectory.rotation import build_matrix, skew
 SMALL_ANGLE_RAD = 0.3
 # Power series in theta^2 of f(theta) = (1 - theta/2 cot(theta/2)) / theta^2 and of f'(theta) /
 # theta
-_SQUARE_TERM_FACTOR_SERIES = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
-_SQUARE_TERM_FACTOR_SLOPE_SERIES = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
+_SQUARE_TERM_FACTOR_COEFFICIENTS = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
+_DERIVATIVE_SERIES_COEFFICIENTS = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
 
 
 def wrap(angle: Array) -> Array:
@@ -55,7 +55,7 @@ def compose(a: Array, b: Array) -> Array:
     d = _get_dimension(a)
     rotation = a[..., 2:] + b[..., 2:] if d == 2 else (_rotation_of(a) * _rotation_of(b)).as_quat()
     return np.concatenate(
-        [a[..., :d] + _multiply_vectors(rotation_matrix(a), b[..., :d]), rotation], axis=-1
+        [a[..., :d] + _multiply_matrix_by_vector(rotation_matrix(a), b[..., :d]), rotation], axis=-1
     )
 
 
@@ -72,7 +72,7 @@ def relative_pose(a: Array, b: Array) -> Array:
         b[..., 2:] - a[..., 2:] if d == 2 else (_rotation_of(a).inv() * _rotation_of(b)).as_quat()
     )
     return np.concatenate(
-        [_multiply_vectors(inverse_rotation, b[..., :d] - a[..., :d]), rotation], axis=-1
+        [_multiply_matrix_by_vector(inverse_rotation, b[..., :d] - a[..., :d]), rotation], axis=-1
     )
 
 
@@ -103,7 +103,7 @@ def log(pose: Array) -> Array:
     d = _get_dimension(pose)
     phi = wrap(pose[..., 2:]) if d == 2 else _rotation_of(pose).as_rotvec()
     return np.concatenate(
-        [_multiply_vectors(_left_jacobian_inverse(phi), pose[..., :d]), phi], axis=-1
+        [_multiply_matrix_by_vector(_left_jacobian_inverse(phi), pose[..., :d]), phi], axis=-1
     )
 
 
@@ -129,22 +129,26 @@ def right_jacobian_inverse(tangent: Array) -> Array:
     tangent : ndarray, shape (..., 3) or (..., 6)
         Tangent vectors with a rotation below 2 pi.
     """
-    commutator = _compute_commutator(tangent)
-    commutator_squared = commutator @ commutator
+    lie_bracket_matrix = _make_lie_bracket_matrix(tangent)
+    lie_bracket_matrix_squared = lie_bracket_matrix @ lie_bracket_matrix
     theta = np.linalg.norm(tangent[..., _get_dimension(tangent) :], axis=-1)[..., None, None]
     square_term_factor = _compute_square_term_factor(theta)
-    half_square_term_factor_slope = 0.5 * _compute_square_term_factor_slope(theta)
-    # Power series of x / (1 - exp(-x)) for the commutator matrix x = ad, with the identity
-    # ad^5 = -2 theta^2 ad^3 - theta^4 ad
+    half_derivative_over_theta = 0.5 * _compute_square_term_derivative_over_theta(theta)
+    # x / (1 - exp(-x)) for the Lie bracket matrix x = ad is 1 + x/2 + a x^2 + b x^4: the identity
+    # ad^5 = -2 theta^2 ad^3 - theta^4 ad replaces all higher powers. The sums of their factors are
+    # a = f - theta f'/2 and b = -f'/(2 theta), with the function f of _compute_square_term_factor
     jacobian: Array = (
-        np.eye(commutator.shape[-1])
-        + 0.5 * commutator
-        + (square_term_factor - theta * theta * half_square_term_factor_slope) * commutator_squared
+        np.eye(lie_bracket_matrix.shape[-1])
+        + 0.5 * lie_bracket_matrix
+        + (square_term_factor - theta * theta * half_derivative_over_theta)
+        * lie_bracket_matrix_squared
     )
-    return jacobian - half_square_term_factor_slope * (commutator_squared @ commutator_squared)
+    return jacobian - half_derivative_over_theta * (
+        lie_bracket_matrix_squared @ lie_bracket_matrix_squared
+    )
 
 
-def _compute_commutator(tangent: Array) -> Array:
+def _make_lie_bracket_matrix(tangent: Array) -> Array:
     """Return the Lie bracket matrices ad(xi) of tangent vectors (Barfoot 2017, 7.33)."""
     d = _get_dimension(tangent)
     rho, rotation = tangent[..., :d], _make_skew_matrix(tangent[..., d:])
@@ -202,7 +206,7 @@ def _rotation_of(pose: Array) -> Rotation:
     return Rotation.from_quat(pose[..., 3:])
 
 
-def _multiply_vectors(matrix: Array, vector: Array) -> Array:
+def _multiply_matrix_by_vector(matrix: Array, vector: Array) -> Array:
     return (matrix @ vector[..., None])[..., 0]
 
 
@@ -223,18 +227,18 @@ def _compute_square_term_factor(theta: Array) -> Array:
     closed_form_value = (1.0 - 0.5 * t / np.tan(0.5 * t)) / t**2
     return np.where(
         theta < SMALL_ANGLE_RAD,
-        polyval(theta * theta, _SQUARE_TERM_FACTOR_SERIES),
+        polyval(theta * theta, _SQUARE_TERM_FACTOR_COEFFICIENTS),
         closed_form_value,
     )
 
 
-def _compute_square_term_factor_slope(theta: Array) -> Array:
+def _compute_square_term_derivative_over_theta(theta: Array) -> Array:
     """Return f'(theta) / theta, for f(theta) = (1 - theta/2 cot(theta/2)) / theta^2."""
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
     half_cot_derivative = 0.5 / np.tan(0.5 * t) - 0.25 * t / np.sin(0.5 * t) ** 2
     closed_form_value = -(half_cot_derivative + 2.0 * (1.0 - 0.5 * t / np.tan(0.5 * t)) / t) / t**3
     return np.where(
         theta < SMALL_ANGLE_RAD,
-        polyval(theta * theta, _SQUARE_TERM_FACTOR_SLOPE_SERIES),
+        polyval(theta * theta, _DERIVATIVE_SERIES_COEFFICIENTS),
         closed_form_value,
     )

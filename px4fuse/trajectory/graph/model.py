@@ -20,7 +20,7 @@ from px4fuse.trajectory.graph.normal_equations import NormalEquations
 MIN_EIGENVALUE_OF_OBSERVED_DIRECTION = 1e-9
 INITIAL_POSES_FROM_FILE = "vertices in the g2o file"
 INITIAL_POSES_FROM_ODOMETRY = "chained odometry edges"
-INITIAL_POSES_FROM_CHORDAL = "chordal initialisation"
+INITIAL_POSES_FROM_CHORDAL_INITIALISATION = "chordal initialisation"
 
 
 @dataclass(frozen=True)
@@ -131,22 +131,24 @@ def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
 def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> None:
     """Raise TrajectoryError if the used edges do not connect all poses of the graph."""
     is_informative = is_used & (np.trace(graph.information, axis1=1, axis2=2) > 0.0)
-    connected_nodes = (graph.first_nodes[is_informative], graph.second_nodes[is_informative])
+    edge_nodes = (graph.first_nodes[is_informative], graph.second_nodes[is_informative])
     node_count = len(graph)
     adjacency = sparse.coo_array(
-        (np.ones(len(connected_nodes[0])), connected_nodes), shape=(node_count, node_count)
+        (np.ones(len(edge_nodes[0])), edge_nodes), shape=(node_count, node_count)
     )
     component_count, component_by_node = connected_components(adjacency, directed=False)
     if component_count > 1:
-        other_vertex = graph.ids[np.flatnonzero(component_by_node != component_by_node[0])[0]]
+        disconnected_vertex_id = graph.ids[
+            np.flatnonzero(component_by_node != component_by_node[0])[0]
+        ]
         raise TrajectoryError(
             f"The pose graph has {component_count} disconnected parts: vertex "
-            f"{other_vertex} is not connected to vertex {graph.ids[0]} by {edges_name}.",
+            f"{disconnected_vertex_id} is not connected to vertex {graph.ids[0]} by {edges_name}.",
             "Connect the parts of the graph, or optimise each part separately.",
         )
 
 
-def compose_odometry(graph: PoseGraph) -> PoseGraph:
+def set_poses_from_odometry(graph: PoseGraph) -> PoseGraph:
     """Return the pose graph with poses from odometry."""
     poses = lie.compose(
         graph.poses[:1], lie.accumulate_poses(get_odometry_steps(graph, find_odometry_edges(graph)))
@@ -189,11 +191,11 @@ def compute_initial_poses(graph: PoseGraph) -> PoseGraph:
     """
     if np.any(find_odometry_edges(graph) < 0):
         return _compute_chordal_poses(graph)
-    composed_graph = compose_odometry(graph)
+    graph_with_odometry_poses = set_poses_from_odometry(graph)
     try:
-        return min(composed_graph, _compute_chordal_poses(graph), key=cost)
+        return min(graph_with_odometry_poses, _compute_chordal_poses(graph), key=cost)
     except TrajectoryError:  # chordal initialisation needs edges with rotation
-        return composed_graph
+        return graph_with_odometry_poses
 
 
 def _compute_chordal_poses(graph: PoseGraph) -> PoseGraph:
@@ -204,15 +206,15 @@ def _compute_chordal_poses(graph: PoseGraph) -> PoseGraph:
     measured_rotation = lie.rotation_matrix(graph.measurements)
     eye = np.broadcast_to(np.eye(dimension), measured_rotation.shape)
     # Linear least squares for matrices R_i: minimise the weighted sum of |Zᵀ R_iᵀ - R_jᵀ|²
-    unconstrained_matrices = _solve_positions(
+    transposed_matrices = _solve_positions(
         graph,
-        measured_rotation.transpose(0, 2, 1),
-        -eye,
-        rotation_information[:, None, None] * eye,
-        0.0 * measured_rotation,
-        lie.rotation_matrix(graph.poses[0]).T,
+        first_pose_matrix=measured_rotation.transpose(0, 2, 1),
+        second_pose_matrix=-eye,
+        information=rotation_information[:, None, None] * eye,
+        right_hand_side=0.0 * measured_rotation,
+        first_pose=lie.rotation_matrix(graph.poses[0]).T,
     )
-    rotation = _find_nearest_rotations(unconstrained_matrices.transpose(0, 2, 1))
+    rotation = _find_nearest_rotations(transposed_matrices.transpose(0, 2, 1))
     # Residual of an edge with rotation Z and translation z: (R_i Z)ᵀ (t_j - t_i - R_i z)
     first_rotation = rotation[graph.first_nodes]
     predicted_second_rotation = first_rotation @ measured_rotation
@@ -230,7 +232,9 @@ def _compute_chordal_poses(graph: PoseGraph) -> PoseGraph:
     else:
         poses = np.column_stack([position, Rotation.from_matrix(rotation).as_quat()])
     poses[0] = graph.poses[0]
-    return replace(graph, poses=poses, initial_pose_origin=INITIAL_POSES_FROM_CHORDAL)
+    return replace(
+        graph, poses=poses, initial_pose_origin=INITIAL_POSES_FROM_CHORDAL_INITIALISATION
+    )
 
 
 def _solve_positions(
@@ -270,6 +274,8 @@ def _solve_positions(
 
 def _find_nearest_rotations(matrices: Array) -> Array:
     """Return the nearest rotations to matrices, shape (n, d, d), in the Frobenius norm."""
-    left_vectors, _, right_vectors = np.linalg.svd(matrices)
-    left_vectors[:, :, -1] *= np.sign(np.linalg.det(left_vectors @ right_vectors))[:, None]
-    return np.asarray(left_vectors @ right_vectors)
+    left_singular_vectors, _, right_singular_vectors = np.linalg.svd(matrices)
+    left_singular_vectors[:, :, -1] *= np.sign(
+        np.linalg.det(left_singular_vectors @ right_singular_vectors)
+    )[:, None]
+    return np.asarray(left_singular_vectors @ right_singular_vectors)

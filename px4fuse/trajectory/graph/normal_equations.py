@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 from scipy.linalg import blas, lapack
-from scipy.sparse.csgraph import depth_first_order
 from scipy.sparse.linalg import splu
 
 from px4fuse.core.arrays import Array, ArrayPair, IntArray
@@ -29,8 +28,10 @@ class _FrontalMatrix(NamedTuple):
     # their equations, which are eliminated later
     unknowns: slice
     remaining_unknowns: IntArray
-    # Range of this front's matrix elements in the flat array of all fronts
-    slice_of_matrix_elements: slice
+    # Matrix blocks of the group, and their rows and columns (in poses) in this frontal matrix
+    blocks: slice
+    block_rows: IntArray
+    block_columns: IntArray
     # Index of the parent front in the elimination tree, and rows of ``remaining_unknowns`` in the
     # matrix of the parent front
     parent_index: int
@@ -50,63 +51,43 @@ class NormalEquations:
     """
 
     def __init__(self, edges: IntArray, unknowns_per_pose: int) -> None:
-        position, group_starts, remaining_poses_by_group = _find_elimination_order(
+        position, eliminated_counts, poses_by_front = _find_elimination_order(
             edges, _MAX_LEAF_UNKNOWNS // unknowns_per_pose
         )
-        poses, offsets_in_pose = np.arange(len(position)), np.arange(unknowns_per_pose)
-        groups, pose_counts = np.arange(len(remaining_poses_by_group)), np.diff(group_starts)
-        group_by_pose = np.repeat(groups, pose_counts)
-        rows_by_group = [
-            np.append(
-                poses[slice(*group_starts[group : group + 2])], remaining_poses_by_group[group]
-            )
-            for group in groups
-        ]
-        row_counts = np.array([len(rows) for rows in rows_by_group])
-        row_starts = np.append(0, np.cumsum(row_counts))
-        keys_of_group_and_row = np.repeat(groups, row_counts) * len(poses) + np.concatenate(
-            rows_by_group
-        )
-        column_counts = pose_counts * unknowns_per_pose
-        element_starts = np.append(0, np.cumsum(row_counts * unknowns_per_pose * column_counts))
-
-        def find_rows(group: IntArray, pose_index: IntArray) -> IntArray:
-            """Return the rows of each pose in the frontal matrix of its group.
-
-            The shape is (n, d) for n poses with d unknowns each.
-            """
-            row = np.searchsorted(keys_of_group_and_row, group * len(poses) + pose_index)
-            return np.asarray(
-                (row - row_starts[group])[:, None] * unknowns_per_pose + offsets_in_pose
-            )
-
-        def find_elements(row_pose: IntArray, column_pose: IntArray) -> IntArray:
-            """Return the flat indices of the matrix block of two poses, shape (n, d, d)."""
-            group = group_by_pose[column_pose]
-            columns = (column_pose - group_starts[group])[:, None] * unknowns_per_pose
-            row_offsets = find_rows(group, row_pose) * column_counts[group][:, None]
-            first_elements = element_starts[group][:, None] + columns + offsets_in_pose
-            return np.asarray(row_offsets[:, :, None] + first_elements[:, None])
-
         edge_positions = position[edges]
-        diagonal_blocks = find_elements(poses, poses)
-        off_diagonal_blocks = find_elements(edge_positions.max(axis=0), edge_positions.min(axis=0))
-        self._element_indices = np.concatenate(
-            [diagonal_blocks[edge_positions].ravel(), off_diagonal_blocks.ravel()]
-        )
+        # Each edge adds to the diagonal blocks of its two poses, and to their common block. Only
+        # blocks below the diagonal are stored: in the column of the pose that is eliminated first
+        columns = np.concatenate([*edge_positions, edge_positions.min(axis=0)])
+        rows = np.concatenate([*edge_positions, edge_positions.max(axis=0)])
+        blocks, block_indices = np.unique(columns * len(position) + rows, return_inverse=True)
+        block_columns, block_rows = np.divmod(blocks, len(position))
+
+        def enumerate_numbers(indices: IntArray, count: int) -> IntArray:
+            """Return the indices of the ``count`` numbers of each pose or matrix block."""
+            return np.asarray((indices[:, None] * count + np.arange(count)).ravel())
+
         self._edges = edges
         self._position = position
-        self._diagonal = np.diagonal(diagonal_blocks, axis1=1, axis2=2)
+        self._element_indices = enumerate_numbers(block_indices, unknowns_per_pose**2)
+        self._diagonal_blocks = np.flatnonzero(block_columns == block_rows)
         self._fronts = []
-        for group, remaining_poses in enumerate(remaining_poses_by_group):
-            parent_index = int(group_by_pose[remaining_poses[0]]) if len(remaining_poses) else group
+        front_by_pose = np.repeat(np.arange(len(poses_by_front)), eliminated_counts)
+        for poses, eliminated_count in zip(poses_by_front, eliminated_counts, strict=True):
+            first_pose, remaining_poses = poses[0], poses[eliminated_count:]
+            eliminated_range = np.array([first_pose, first_pose + eliminated_count])
+            front_blocks = slice(*np.searchsorted(block_columns, eliminated_range))
+            # The parent front eliminates the first of the remaining poses. The last front has none
+            parent_index = int(front_by_pose[remaining_poses[0]]) if len(remaining_poses) else 0
+            parent_rows = np.searchsorted(poses_by_front[parent_index], remaining_poses)
             self._fronts.append(
                 _FrontalMatrix(
-                    slice(*group_starts[group : group + 2] * unknowns_per_pose),
-                    (remaining_poses[:, None] * unknowns_per_pose + offsets_in_pose).ravel(),
-                    slice(*element_starts[group : group + 2]),
+                    slice(*eliminated_range * unknowns_per_pose),
+                    enumerate_numbers(remaining_poses, unknowns_per_pose),
+                    front_blocks,
+                    np.searchsorted(poses, block_rows[front_blocks]),
+                    block_columns[front_blocks] - first_pose,
                     parent_index,
-                    find_rows(np.full(len(remaining_poses), parent_index), remaining_poses).ravel(),
+                    enumerate_numbers(parent_rows, unknowns_per_pose),
                 )
             )
 
@@ -119,7 +100,7 @@ class NormalEquations:
     ) -> ArrayPair:
         """Assemble the normal equations of ``A x_i + B x_j = c`` over all edges (i, j).
 
-        Return the matrix elements (a flat array), and the right-hand sides, shape (n, d, k).
+        Return the blocks of the matrix, and the right-hand sides, shape (n, d, k).
 
         Parameters
         ----------
@@ -128,49 +109,58 @@ class NormalEquations:
         """
         pose_matrices = np.stack([first_pose_matrix, second_pose_matrix])
         weighted_matrices = pose_matrices.swapaxes(2, 3) @ information
+        # Blocks in the rows of the first pose, or transposed if the first pose is eliminated first
         off_diagonal_blocks = weighted_matrices[0] @ second_pose_matrix
         is_first_earlier = np.less(*self._position[self._edges])
         off_diagonal_blocks[is_first_earlier] = off_diagonal_blocks[is_first_earlier].swapaxes(1, 2)
-        blocks = np.concatenate(
-            [(weighted_matrices @ pose_matrices).ravel(), off_diagonal_blocks.ravel()]
+        edge_blocks = [*(weighted_matrices @ pose_matrices), off_diagonal_blocks]
+        elements = np.asarray(np.bincount(self._element_indices, np.ravel(edge_blocks)), float)
+        matrix_blocks = elements.reshape(-1, *information.shape[1:])
+        matrix_blocks[self._diagonal_blocks[self._position[0]]] += _FIXED_POSE_INFORMATION * np.eye(
+            information.shape[1]
         )
-        matrix_elements = np.asarray(np.bincount(self._element_indices, blocks), dtype=float)
-        matrix_elements[self._diagonal[self._position[0]]] = _FIXED_POSE_INFORMATION
         right_hand_sides = np.zeros((len(self._position), *right_hand_side.shape[1:]))
         np.add.at(right_hand_sides, self._edges, weighted_matrices @ right_hand_side)
-        return matrix_elements, right_hand_sides
+        return matrix_blocks, right_hand_sides
 
     def solve(
-        self, matrix_elements: Array, right_hand_sides: Array, damping: float = 0.0
+        self, matrix_blocks: Array, right_hand_sides: Array, damping: float = 0.0
     ) -> Array | None:
         """Solve the equations, with damping added to the diagonal.
 
         Return None if the matrix is not positive definite.
         """
-        matrix_elements = matrix_elements.copy()
-        matrix_elements[self._diagonal] += damping
+        _, unknowns_per_pose, right_hand_side_count = right_hand_sides.shape
+        matrix_blocks = matrix_blocks.copy()
+        matrix_blocks[self._diagonal_blocks] += damping * np.eye(unknowns_per_pose)
         solution = np.empty_like(right_hand_sides)
         solution[self._position] = right_hand_sides
-        solution = solution.reshape(self._diagonal.size, -1)
+        solution = solution.reshape(-1, right_hand_side_count)
         schur_complements = defaultdict[int, list[tuple[IntArray, Array]]](list)
         factors = []
         for index, front in enumerate(self._fronts):
             unknowns, remaining_unknowns = front.unknowns, front.remaining_unknowns
             size = unknowns.stop - unknowns.start
-            matrix = np.zeros((size + len(remaining_unknowns),) * 2)
-            matrix[:, :size] = matrix_elements[front.slice_of_matrix_elements].reshape(-1, size)
+            row_count = size + len(remaining_unknowns)
+            # Matrix [[D, Bᵀ], [B, C]] with the eliminated unknowns first. Only the triangle below
+            # the diagonal is used
+            matrix = np.zeros((row_count, row_count))
+            matrix.reshape(
+                row_count // unknowns_per_pose, unknowns_per_pose, -1, unknowns_per_pose
+            )[front.block_rows, :, front.block_columns] = matrix_blocks[front.blocks]
             for rows, schur_complement in schur_complements.pop(index, ()):
                 matrix[rows[:, None], rows] += schur_complement
+            # Cholesky factor U of D = UᵀU
             cholesky_factor, failed_row = lapack.dpotrf(matrix[:size, :size].T)
             if failed_row:
                 return None
             solution[unknowns] = blas.dtrsm(1.0, cholesky_factor, solution[unknowns], trans_a=1)
             off_diagonal_factor = matrix[size:, :size].T
             if len(remaining_unknowns):
+                # F = U⁻ᵀ Bᵀ, and Schur complement C - FᵀF
                 off_diagonal_factor = blas.dtrsm(
                     1.0, cholesky_factor, off_diagonal_factor, trans_a=1
                 )
-                # Only the lower triangle of the symmetric matrix is computed
                 schur_complement = blas.dsyrk(
                     -1.0, off_diagonal_factor, 1.0, matrix[size:, size:].T, trans=1
                 ).T
@@ -179,6 +169,7 @@ class NormalEquations:
                 )
                 solution[remaining_unknowns] -= off_diagonal_factor.T @ solution[unknowns]
             factors.append((unknowns, remaining_unknowns, cholesky_factor, off_diagonal_factor))
+        # Back substitution, from the last to the first eliminated unknowns
         for unknowns, remaining_unknowns, cholesky_factor, off_diagonal_factor in reversed(factors):
             terms_of_solved_unknowns = off_diagonal_factor @ solution[remaining_unknowns]
             solution[unknowns] = blas.dtrsm(
@@ -192,61 +183,68 @@ class NormalEquations:
 def _find_elimination_order(
     edges: IntArray, max_poses_per_leaf_group: int
 ) -> tuple[IntArray, IntArray, list[IntArray]]:
-    """Return the order of elimination of n poses in g groups.
+    """Return the order of elimination of n poses in g frontal matrices.
 
     Returns
     -------
     position : ndarray of int, shape (n,)
         Index of each pose in the order of elimination.
-    group_starts : ndarray of int, shape (g + 1,)
-        Index of the first pose of each group, and n.
-    remaining_poses_by_group : list of ndarray of int
-        Poses in the equations of each group that are eliminated later.
+    eliminated_counts : ndarray of int, shape (g,)
+        Number of poses that are eliminated in each front.
+    poses_by_front : list of ndarray of int
+        Ascending positions of the poses in each front: those that it eliminates, then others.
     """
-    rows = np.tile(np.arange(edges.shape[1]), 2)
-    incidence_matrix = sparse.csc_array(
-        (np.repeat([1.0, -1.0], edges.shape[1]), (rows, edges.ravel()))
-    )
-    pose_count = incidence_matrix.shape[1]
-    first_pose_anchor_matrix = sparse.csc_array(([1.0], ([0], [0])), shape=(pose_count, pose_count))
-    lu_factors = splu(
-        (incidence_matrix.T @ incidence_matrix + first_pose_anchor_matrix).tocsc(),
-        # This elimination order gives fewer nonzeros than the default COLAMD
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        # By default, SuperLU merges columns with different nonzeros (relaxed supernodes), and then
-        # stores zeros. This is switched off, because the code below counts the stored elements
-        relax=1,
-        options={"SymmetricMode": True},
-    )
-    factor = lu_factors.L.sorted_indices()
-    nonzero_counts = np.diff(factor.indptr)
-    # The parent of a pose in the elimination tree is the first nonzero row below the diagonal
-    parent = factor.indices[factor.indptr[:-2] + 1]
-    last_pose = pose_count - 1
-    tree = sparse.csr_array(
-        (nonzero_counts[:-1], (last_pose - parent, last_pose - np.arange(last_pose))),
-        shape=first_pose_anchor_matrix.shape,
-    )
-    elimination_order = last_pose - depth_first_order(tree, 0, return_predecessors=False)[::-1]
-    position = np.argsort(elimination_order)
-    nonzero_counts = nonzero_counts[elimination_order]
-    parent = np.append(position[parent[elimination_order[:-1]]], pose_count)
-    subtree_size = np.ones(pose_count + 1, dtype=np.intp)
-    for pose_index, pose_parent in enumerate(parent.tolist()):
-        subtree_size[pose_parent] += subtree_size[pose_index]
-    is_large_subtree = subtree_size > max_poses_per_leaf_group
-    is_large_subtree[pose_count] = True
-    leaf_subtree_ends = np.flatnonzero(~is_large_subtree[:-1] & is_large_subtree[parent])
-    # A pose is merged with its child in the elimination tree if their columns of the Cholesky
-    # factor have the same nonzero rows
-    is_parent_next = parent[:-1] == np.arange(1, pose_count)
-    is_merged_with_child = is_large_subtree[:-2] & is_parent_next & (np.diff(nonzero_counts) == -1)
-    is_group_start = is_large_subtree[:-1] & ~np.append(False, is_merged_with_child)
-    is_group_start[leaf_subtree_ends - subtree_size[leaf_subtree_ends] + 1] = True
-    group_starts = np.append(np.flatnonzero(is_group_start), pose_count)
-    remaining_poses_by_group = [
-        np.sort(position[factor.indices[slice(*factor.indptr[pose_index : pose_index + 2])]])[1:]
-        for pose_index in elimination_order[group_starts[1:] - 1]
+    sparse_order = _find_sparse_order(edges)
+    remaining_poses, subtree_sizes = _build_elimination_tree(sparse_order[edges])
+    # Each pose is eliminated together with its parent if both are in a small subtree, or if their
+    # columns of the Cholesky factor have the same nonzero rows
+    last_poses = np.arange(len(sparse_order))
+    for pose in reversed(range(len(sparse_order) - 1)):
+        parent = min(remaining_poses[pose])
+        if subtree_sizes[parent] <= max_poses_per_leaf_group or (
+            subtree_sizes[pose] > max_poses_per_leaf_group
+            and len(remaining_poses[pose]) == len(remaining_poses[parent]) + 1
+        ):
+            last_poses[pose] = last_poses[parent]
+    # In the order of their last poses, each front is eliminated before its parent
+    position = np.argsort(np.argsort(last_poses, kind="stable"))
+    last_poses, eliminated_counts = np.unique(last_poses, return_counts=True)
+    poses_by_front = [
+        np.append(np.arange(end - count, end), np.sort(position[list(remaining_poses[pose])]))
+        for pose, count, end in zip(
+            last_poses.tolist(), eliminated_counts, np.cumsum(eliminated_counts), strict=True
+        )
     ]
-    return position[lu_factors.perm_c], group_starts, remaining_poses_by_group
+    return position[sparse_order], eliminated_counts, poses_by_front
+
+
+def _find_sparse_order(edges: IntArray) -> IntArray:
+    """Return the index of each pose in an order of elimination with few nonzeros.
+
+    The order is computed for a matrix with one unknown per pose.
+    """
+    edge_count, pose_count = edges.shape[1], int(edges.max()) + 1
+    adjacency = sparse.csc_array((np.ones(edge_count), edges), shape=(pose_count, pose_count))
+    # The diagonal makes the matrix positive definite
+    matrix = adjacency + adjacency.T + (edge_count + 1.0) * sparse.eye_array(pose_count)
+    # The minimum degree order gives fewer nonzeros than the default COLAMD
+    order = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).perm_c
+    return np.asarray(order, dtype=np.intp)
+
+
+def _build_elimination_tree(edges: IntArray) -> tuple[list[set[int]], list[int]]:
+    """Return the remaining poses of each pose, and the size of its subtree.
+
+    The remaining poses of a pose are the nonzero rows below the diagonal in its column of the
+    Cholesky factor: its later neighbours, and the remaining poses of its children. The first of
+    them is its parent.
+    """
+    remaining_poses: list[set[int]] = [set() for _ in range(int(edges.max()) + 1)]
+    for first, second in np.sort(edges, axis=0).T.tolist():
+        remaining_poses[first].add(second)
+    subtree_sizes = [1] * len(remaining_poses)
+    for pose in range(len(remaining_poses) - 1):
+        parent = min(remaining_poses[pose])
+        remaining_poses[parent] |= remaining_poses[pose] - {parent}
+        subtree_sizes[parent] += subtree_sizes[pose]
+    return remaining_poses, subtree_sizes

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import chdtri, gammaincinv
 
 from px4fuse.core.arrays import Array, BoolArray
-from px4fuse.core.record import NOT_IN_JSON, Count, NotInJson, NotNegative, Record
+from px4fuse.core.record import NOT_IN_JSON, Count, NonNegativeFloat, NotInJson, Record
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.graph import lie, model
@@ -30,7 +30,7 @@ MAX_ITERATIONS = 100
 # Initial damping of Levenberg-Marquardt, as in GTSAM
 _INITIAL_DAMPING = 1e-5
 # Factor on the damping after a rejected step, as in GTSAM
-_DAMPING_FACTOR = 10.0
+_DAMPING_CHANGE_FACTOR = 10.0
 # Maximum damping of Levenberg-Marquardt, as in GTSAM
 _MAX_DAMPING = 1e5
 # Minimum ratio of actual to predicted cost decrease of an accepted step, as in GTSAM
@@ -65,9 +65,9 @@ class Solution(Record, kw_only=True):
     """Optimised poses of a pose graph, with cost and convergence."""
 
     # Half of the sum of the squared Mahalanobis distances before the optimisation
-    cost_initial: NotNegative
+    cost_initial: NonNegativeFloat
     # Half of the weighted sum of the squared Mahalanobis distances after the optimisation
-    cost: NotNegative
+    cost: NonNegativeFloat
     # Number of accepted Levenberg-Marquardt steps
     iterations: Count
     # True if the optimisation reached the cost tolerance
@@ -148,17 +148,15 @@ def _minimise(
         first_pose_jacobian = second_pose_jacobian @ lie.adjoint(
             lie.inverse(residuals.relative_poses)
         )
-        matrix_elements, gradient = graph.normal_equations.assemble(
+        matrix_blocks, gradient = graph.normal_equations.assemble(
             -first_pose_jacobian,
             second_pose_jacobian,
             weights[:, None, None] * graph.information,
             -residuals.residual[..., None],
         )
+        # Increase the damping until a step decreases the cost, or hardly changes it
         while True:
-            cost_decrease = 0.0
-            predicted_decrease = 0.0
-            is_converged = False
-            step = graph.normal_equations.solve(matrix_elements, gradient, damping)
+            step = graph.normal_equations.solve(matrix_blocks, gradient, damping)
             if step is not None:
                 predicted_decrease = 0.5 * float(np.sum(step * (damping * step + gradient)))
                 trial_residuals = model.residuals(
@@ -166,21 +164,22 @@ def _minimise(
                 )
                 cost_decrease = cost - float(np.sum(0.5 * weights * trial_residuals.chi2))
                 is_converged = abs(cost_decrease) < relative_cost_tolerance * cost
-            is_accepted = (
-                predicted_decrease > sys.float_info.epsilon * cost
-                and cost_decrease > _MIN_COST_DECREASE_RATIO * predicted_decrease
-            )
-            if is_accepted or is_converged or damping >= _MAX_DAMPING:
-                break
-            damping *= _DAMPING_FACTOR
+                is_accepted = (
+                    predicted_decrease > sys.float_info.epsilon * cost
+                    and cost_decrease > _MIN_COST_DECREASE_RATIO * predicted_decrease
+                )
+                if is_accepted or is_converged:
+                    break
+            if damping >= _MAX_DAMPING:
+                return _Optimum(residuals, iterations, False)
+            damping *= _DAMPING_CHANGE_FACTOR
         if not is_accepted:
-            return _Optimum(residuals, iterations, is_converged)
+            return _Optimum(residuals, iterations, True)
         residuals = trial_residuals
-        cost_before = cost
-        cost = cost - cost_decrease
+        cost -= cost_decrease
         iterations += 1
-        damping /= _DAMPING_FACTOR
-        if cost_decrease <= max(relative_cost_tolerance * cost_before, _COST_TOLERANCE):
+        damping /= _DAMPING_CHANGE_FACTOR
+        if is_converged or cost_decrease <= _COST_TOLERANCE:
             return _Optimum(residuals, iterations, True)
     return _Optimum(residuals, iterations, cost <= _COST_TOLERANCE)
 
@@ -192,6 +191,8 @@ def _solve_gnc(
     can_be_false_closure: BoolArray,
 ) -> tuple[_Optimum, Array]:
     """Reject false closures by graduated non-convexity; return the optimum and the edge weights."""
+    # Quantiles of χ²: an edge with a smaller χ² keeps full weight, and a dropped edge adds a
+    # constant cost. Other edges than closures are never dropped
     half_degrees_of_freedom = model.count_observed_directions(graph.information) / 2.0
     chi2_bound = np.where(
         can_be_false_closure & (half_degrees_of_freedom > 0.0),
@@ -203,6 +204,7 @@ def _solve_gnc(
     def compute_truncated_cost(residuals: Residuals, edge_weights: Array) -> float:
         return 0.5 * float(np.sum(np.where(edge_weights > 0.0, residuals.chi2, cost_if_dropped)))
 
+    # The result depends on the start: try the least-squares optimum and the initial poses
     iteration_count = unweighted_optimum.iterations
     solutions = []
     for initial_residuals in (unweighted_optimum.residuals, start_residuals):
@@ -210,6 +212,7 @@ def _solve_gnc(
         iteration_count += optimum.iterations
         solutions.append((compute_truncated_cost(optimum.residuals, weights), optimum, weights))
     lowest_cost, optimum, weights = min(solutions, key=lambda solution: solution[0])
+    # Restore each dropped closure, smallest χ² first, if this decreases the cost
     dropped_edges = np.flatnonzero(weights == 0.0)
     for edge_index in dropped_edges[np.argsort(optimum.residuals.chi2[dropped_edges])][
         :_MAX_TRIALS_TO_RESTORE_CLOSURES
@@ -232,9 +235,9 @@ def _run_gnc(
     residuals = start_residuals
     iteration_count = 0
     # Initial control parameter: the inverse of the maximum over all edges (Yang 2020, section V)
-    inverse_control_by_edge = 2.0 * residuals.chi2 / chi2_bound - 1.0
-    if np.max(inverse_control_by_edge) > 0.0:
-        control_parameter = 1.0 / float(np.max(inverse_control_by_edge))
+    inverse_control_parameter_by_edge = 2.0 * residuals.chi2 / chi2_bound - 1.0
+    if np.max(inverse_control_parameter_by_edge) > 0.0:
+        control_parameter = 1.0 / float(np.max(inverse_control_parameter_by_edge))
         for _ in range(_MAX_GNC_STAGES):
             # avoid a division by zero
             chi2_ratio = np.maximum(residuals.chi2 / chi2_bound, 1e-200)
@@ -290,9 +293,9 @@ class Graph(Record, kw_only=True):
     poses: Count
     edges: Count
     initialised: str
-    reduced_chi2: NotNegative
-    reduced_chi2_interval: tuple[NotNegative, NotNegative]
-    information_factor: NotNegative
+    reduced_chi2: NonNegativeFloat
+    reduced_chi2_interval: tuple[NonNegativeFloat, NonNegativeFloat]
+    information_factor: NonNegativeFloat
     gates: tuple[GateResult, ...] | Unavailable
     solutions: Mapping[str, Solution]
 
@@ -329,6 +332,8 @@ def analyse_graph(
     closure_tests: tuple[GateResult, ...] | Unavailable
     try:
         closure_tests = tuple(gate_edges(graph, closure_edges))
+        # If the information matrices seem too large, divide them by the factor and test again. Both
+        # estimates of the factor must be large: false closures enlarge the reduced χ² only
         if (
             reduced_chi2 > reduced_chi2_interval[1]
             and len(closure_tests) >= MIN_CLOSURES_FOR_SCALE_FACTOR
