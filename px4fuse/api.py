@@ -107,7 +107,6 @@ def compare(
     LogError, MissingDataError, SettingsError
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
-    arguments = locals()  # the names are fields of ComparisonRequest
     known_axes = get_args(request.AxisName)
     axis_names = (axes,) if isinstance(axes, str) else tuple(axes)
     if unknown_axes := set(axis_names).difference(known_axes):
@@ -124,17 +123,26 @@ def compare(
         raise SettingsError(
             f"`clock_offset_s` {clock_offset_s!r} is not a number of seconds or 'auto'."
         )
-    request_fields = {name: arguments[name] for name in request.ComparisonRequest.__struct_fields__}
-    request_fields |= {
-        "log": log.log.name if isinstance(log, Flight) else str(log),
-        "axes": axis_names,
-    }
     if isinstance(position, str | Path):
-        request_fields["position"] = request.PositionFile(path=str(position))
-    if isinstance(clock_offset_s, int):
-        request_fields["clock_offset_s"] = float(clock_offset_s)
-    flight = log if isinstance(log, Flight) else None
-    return diagnose(request.ComparisonRequest(**request_fields), progress, flight)
+        position = request.PositionFile(path=str(position))
+    comparison_request = request.ComparisonRequest(
+        log=log.log.name if isinstance(log, Flight) else str(log),
+        system=system,
+        position=position,
+        position_source=position_source,
+        source_kind=source_kind,
+        height=height,
+        sigma_a_m_s2=sigma_a_m_s2,
+        sigma_z_m=sigma_z_m,
+        dt_s=dt_s,
+        input=input,
+        axes=axis_names,
+        heading_deg=heading_deg,
+        start_s=start_s,
+        end_s=end_s,
+        clock_offset_s=clock_offset_s,
+    )
+    return diagnose(comparison_request, progress, log if isinstance(log, Flight) else None)
 
 
 def table(analysis: Analysis) -> pd.DataFrame:
@@ -247,9 +255,19 @@ def close_loop(
     TrajectoryError, LogError, MissingDataError, SettingsError
         A file cannot be read or lacks required data, or a number is out of range.
     """
-    request_fields = {name: value for name, value in locals().items() if name != "progress"}
-    request_fields |= {"source": str(source), "reference": None, "closures": tuple(closures)}
-    request_fields["landed_at"] = None if landed_at is None else request.Landing(*landed_at)
+    # without reference: it may be a Trajectory, and is passed separately
+    loop_request = request.LoopRequest(
+        source=str(source),
+        frame=frame,
+        start_s=start_s,
+        end_s=end_s,
+        landed_at=None if landed_at is None else request.Landing(*landed_at),
+        closed_loop=closed_loop,
+        closures=tuple(closures),
+        position_drift_m=position_drift_m,
+        heading_drift_deg=heading_drift_deg,
+        key_frames_m=key_frames_m,
+    )
     if isinstance(source, Trajectory):
         loop_source = LoopSource(source, None)
     else:
@@ -257,7 +275,7 @@ def close_loop(
     reference_track = (
         None if reference is None else _read_trajectory(reference, default_track="truth")
     )
-    return analyse(loop_source, request.LoopRequest(**request_fields), reference_track, progress)
+    return analyse(loop_source, loop_request, reference_track, progress)
 
 
 def write_report(analysis: Analysis, path: Pathlike) -> Path:

@@ -31,9 +31,9 @@ Further functions: :func:`diagnose_or_check_aids` also analyses flights without 
 :func:`run_what_if` is ``px4fuse whatif``, and :func:`analyse_loop_closure` is ``px4fuse loop``.
 """
 
-from dataclasses import MISSING, fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from msgspec import structs
 
@@ -153,23 +153,25 @@ def diagnose_comparison(comparison: Comparison, progress: Progress = ignore_prog
     If students must find the faults, only the comparison is returned.
     """
     if comparison.flight.log.is_assessed:
-        withheld_fields: dict[str, Any] = {
-            field.name: DIAGNOSIS_WITHHELD
-            for field in fields(Analysis)
-            if field.default is MISSING and field.name not in vars(comparison)
-        }
+        withheld = DIAGNOSIS_WITHHELD
         return Analysis(
-            **vars(comparison)
-            | withheld_fields
-            | {
-                "tuning": {HORIZONTAL: DIAGNOSIS_WITHHELD},
-                "difference_steps": dict.fromkeys(comparison.axes, DIAGNOSIS_WITHHELD),
-                "reruns": (),
-                "events": collect_events(comparison),
-            }
+            **vars(comparison),
+            tuning={HORIZONTAL: withheld},
+            time_offset=withheld,
+            heading=withheld,
+            systematic_errors=withheld,
+            source_low_pass=withheld,
+            time_correlated_noise=withheld,
+            ekf2_model=withheld,
+            difference_steps=dict.fromkeys(comparison.axes, withheld),
+            reruns=(),
+            events=collect_events(comparison),
+            aids=withheld,
+            loop=withheld,
         )
     estimates = estimate(comparison, progress)
     release_free_memory()
+    # the delay that the findings report; it does not change the re-runs
     comparison = refine_delay(comparison, estimates.time_offset)
     reruns = rerun(comparison, estimates, progress)
     release_free_memory()

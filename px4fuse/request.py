@@ -322,7 +322,9 @@ def command_line(
             arguments += ["--sweep", f"{sweep.parameter}={range_text}"]
         for name in shown_request.without:
             arguments += ["--without", name]
-        for start_s in {*shown_request.without.values()} - {0.0}:
+        # px4fuse whatif gives all aiding sources the same start
+        start_s = max(shown_request.without.values(), default=0.0)
+        if start_s:
             arguments += ["--from", _format_value(start_s)]
     command_words = ["px4fuse", *arguments]
     return quote_command(command_words) if for_shell else shlex.join(command_words)

@@ -21,6 +21,7 @@ from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.text import Text
+from msgspec import Struct, structs
 
 from px4fuse.report.page import PageBlock
 
@@ -87,6 +88,8 @@ def value(part: Any, digits: int = 4) -> str:
         return str(part)
     if isinstance(part, float | int | np.floating | np.integer):
         return f"{0.0 if abs(part) < 1e-9 else part:.{digits}g}"
+    if isinstance(part, Struct):
+        part = structs.asdict(part)
     if isinstance(part, Mapping):
         return "{" + ", ".join(f"{name}: {value(each)}" for name, each in part.items()) + "}"
     if isinstance(part, Sequence | np.ndarray):
@@ -201,6 +204,8 @@ def of_blocks(blocks: Sequence[PageBlock]) -> Iterator[str]:
 
 def of_values(part: Any, path: str = "") -> Iterator[str]:
     """Yield each value of nested data with its path."""
+    if isinstance(part, Struct):
+        part = structs.asdict(part)
     if isinstance(part, Mapping):
         for name, below in part.items():
             yield from of_values(below, f"{path}.{name}" if path else str(name))

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from msgspec import Struct, structs
 from pypdf import PdfReader
 
 from px4fuse.report.page import Page, PageBlock, to_typst_data
@@ -19,7 +20,7 @@ def every(blocks: Sequence[PageBlock]) -> Iterator[PageBlock]:
     """Yield blocks and nested blocks in order."""
     for block in blocks:
         yield block
-        for inner in (*block.get("columns", ()), block.get("blocks", ())):
+        for inner in block.get("columns", ()):
             yield from every(inner)
 
 
@@ -29,7 +30,7 @@ def texts(*pages: Page) -> list[str]:
     for page in pages:
         for block in every(page.blocks):
             if block["kind"] == "cover":
-                found += list(_strings({**block, "blocks": ()}))
+                found += list(_strings(block))
                 continue
             label = block["label"]["text"].split("\n") if "label" in block else ()
             cells = [cell for row in block.get("rows", ()) for cell in row]
@@ -43,6 +44,8 @@ def _strings(value: Any) -> Iterator[str]:
     """Yield all texts of nested mappings and sequences."""
     if isinstance(value, str):
         yield value
+    elif isinstance(value, Struct):
+        yield from _strings(structs.asdict(value))
     elif isinstance(value, Mapping):
         for inner in value.values():
             yield from _strings(inner)

@@ -135,19 +135,23 @@ def build_card(
         headline = "Assignment: the student makes the diagnosis, so px4fuse prints none"
         return DiagnosisCard(severity="note", headline=headline, identity=analysis_description)
     cause_findings = [group[0] for group in split_cause_groups(analysis.findings)]
-    sigma_verdicts = make_sigma_verdicts(analysis.main)
+    verdicts = make_sigma_verdicts(analysis.main)
     ranked_causes = rank_causes(analysis, cause_findings)
     causes = tuple(
-        make_cause(analysis, ranked_finding, sigma_verdicts, request)
-        for ranked_finding in ranked_causes[:MAX_CAUSES_ON_CARD]
+        make_cause(analysis, ranked_cause, verdicts, request)
+        for ranked_cause in ranked_causes[:MAX_CAUSES_ON_CARD]
     )
-    sigma_verdicts, explanation = _explain_verdict_differences(analysis, sigma_verdicts, causes)
+    # the same verdicts; those that need no change of settings are marked as explained
+    sigma_verdicts, explanation = _explain_verdict_differences(analysis, verdicts, causes)
     effect = _summarise_errors(analysis)
-    has_fault = any(verdict.is_fault for verdict in sigma_verdicts)
-    severity: CardSeverity = "note" if has_fault else "clean"
+    severity: CardSeverity = "clean"
+    if causes:
+        severity = causes[0].severity
+    elif any(verdict.is_fault for verdict in sigma_verdicts):
+        severity = "note"
     notes = _make_notes(cause_findings, request.log)
     return DiagnosisCard(
-        severity=causes[0].severity if causes else severity,
+        severity=severity,
         id=causes[0].id if causes else "",
         headline=_make_headline(causes, sigma_verdicts),
         effect=effect,
@@ -292,7 +296,6 @@ def _compute_horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
 def _describe_effect(
     analysis: Analysis, effect: FlightErrors, sigma_verdicts: Sequence[Verdict]
 ) -> str:
-    sentences, segment, flight = [], analysis.segment, analysis.segment.whole_flight
     if analysis.flight.airborne == () and has_little_motion(analysis):
         return (
             "The vehicle stayed on the ground, so the errors of KF and EKF2 apply only to a "
@@ -300,29 +303,12 @@ def _describe_effect(
         )
     if is_height_only(analysis.source):
         return "The source measures only the height, so horizontal errors are not evaluated."
-    if effect.position_rmse_m:
-        span_text = ""
-        if max(segment.start_s - flight.start_s, flight.end_s - segment.end_s) > MIN_GAP_S:
-            span_text = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s"
-        sentences.append(
-            f"Position RMSE along {analysis.main.axis.label}{span_text}: "
-            f"{_format_lengths(effect.position_rmse_m)}."
-        )
-        if effect.horizontal_rmse_m:
-            sentences.append(f"Horizontal RMSE: {_format_lengths(effect.horizontal_rmse_m)}.")
-        sentences += [
-            f"The position error of {FILTER_NAMES[verdict.filter]} is "
-            f"{format_ratio(verdict.ratio)} times its reported σ."
-            for verdict in sigma_verdicts
-            if verdict.against == "truth" and verdict.ratio and verdict.word != "consistent"
-        ]
-        sentences += _describe_worst_axis(analysis)
-    if effect.difference_rms_m is not None and (
-        not effect.position_rmse_m
-        or all(verdict.word == "consistent" for verdict in sigma_verdicts)
-    ):
+    has_truth = bool(effect.position_rmse_m)
+    sentences = _describe_position_errors(analysis, effect, sigma_verdicts) if has_truth else []
+    is_consistent = all(verdict.word == "consistent" for verdict in sigma_verdicts)
+    if effect.difference_rms_m is not None and (is_consistent or not has_truth):
         sentences.append(f"{_format_difference(effect.axis, effect.difference_rms_m)}.")
-    if not effect.position_rmse_m:
+    if not has_truth:
         sentences.append(
             "The log has no ground truth, so the position errors of KF and EKF2 are unknown."
         )
@@ -335,8 +321,33 @@ def _describe_effect(
     return " ".join(sentences)
 
 
+def _describe_position_errors(
+    analysis: Analysis, effect: FlightErrors, sigma_verdicts: Sequence[Verdict]
+) -> list[str]:
+    """Describe the errors against ground truth."""
+    segment, flight, span_text = analysis.segment, analysis.segment.whole_flight, ""
+    if max(segment.start_s - flight.start_s, flight.end_s - segment.end_s) > MIN_GAP_S:
+        span_text = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s"
+    sentences = [
+        f"Position RMSE along {analysis.main.axis.label}{span_text}: "
+        f"{_format_lengths(effect.position_rmse_m)}."
+    ]
+    if effect.horizontal_rmse_m:
+        sentences.append(f"Horizontal RMSE: {_format_lengths(effect.horizontal_rmse_m)}.")
+    sentences += [
+        f"The position error of {FILTER_NAMES[verdict.filter]} is "
+        f"{format_ratio(verdict.ratio)} times its reported σ."
+        for verdict in sigma_verdicts
+        if verdict.against == "truth" and verdict.ratio and verdict.word != "consistent"
+    ]
+    return sentences + _describe_worst_axis(analysis)
+
+
 def _describe_worst_axis(analysis: Analysis) -> list[str]:
+    """State EKF2's error along another axis if it is overconfident there, more than along main."""
+
     def compute_error_to_sigma_ratio(result: AxisComparison) -> float:
+        # 0 for an axis that cannot be the worst: its error is unknown, or only EKF2's output lag
         truth = result.filters["ekf2"].truth
         if isinstance(truth, Unavailable) or (
             truth.has_only_lag_errors and result is not analysis.main
@@ -418,29 +429,26 @@ def _mark_explained_verdicts(
     - the filter is underconfident only against its source, and the source may drift.
     """
     filters_to_keep_unchanged = {
-        name
+        label
         for cause in causes
         for action in cause.actions
-        if action.sentence.startswith("keep the settings")
-        for name in action.target.split(", ")
+        if action.keeps_settings
+        for label in action.target.split(", ")  # the target may be "KF, EKF2"
     }
     truth_verdict_word_by_filter = {
         verdict.filter: verdict.word for verdict in sigma_verdicts if verdict.against == "truth"
     }
+
+    def needs_no_change(verdict: Verdict) -> bool:
+        true_word = truth_verdict_word_by_filter[verdict.filter]
+        if FILTER_NAMES[verdict.filter] in filters_to_keep_unchanged or true_word == "consistent":
+            return True
+        # Innovations do not contain drift, so small innovations do not prove a too large σ
+        has_small_innovations = (verdict.against, verdict.word) == ("source", "underconfident")
+        return may_drift and has_small_innovations and true_word != "underconfident"
+
     return tuple(
-        replace(verdict, is_explained=True)
-        if verdict.is_fault
-        and (
-            FILTER_NAMES[verdict.filter] in filters_to_keep_unchanged
-            or truth_verdict_word_by_filter.get(verdict.filter) == "consistent"
-            # Innovations do not contain drift, so small innovations do not prove a too large σ
-            or (
-                may_drift
-                and (verdict.against, verdict.word) == ("source", "underconfident")
-                and truth_verdict_word_by_filter.get(verdict.filter) != "underconfident"
-            )
-        )
-        else verdict
+        replace(verdict, is_explained=verdict.is_fault and needs_no_change(verdict))
         for verdict in sigma_verdicts
     )
 
@@ -456,17 +464,14 @@ def _explain_verdict_differences(
     sigma_verdicts = _mark_explained_verdicts(sigma_verdicts, causes, may_drift=may_drift)
     mean_position_nees_at_horizon = getattr(ekf2_errors, "nees_position_horizon_mean", None)
     horizon_sigma_ratio = math.sqrt(mean_position_nees_at_horizon or math.inf)
-    # The second verdict on EKF2 is against ground truth
-    *_, ekf2_verdict = (verdict for verdict in sigma_verdicts if verdict.filter == "ekf2")
+    # make_sigma_verdicts returns the verdict on EKF2 against ground truth last
+    *other_verdicts, ekf2_verdict = sigma_verdicts
     if (
         not causes
         and ekf2_verdict.word == "overconfident"
         and classify_sigma_ratio(horizon_sigma_ratio, "truth") == "consistent"
     ):
-        return tuple(
-            replace(verdict, is_explained=True) if verdict is ekf2_verdict else verdict
-            for verdict in sigma_verdicts
-        ), (
+        return (*other_verdicts, replace(ekf2_verdict, is_explained=True)), (
             "EKF2 reports σ for its delayed position at the fusion horizon. The error of the "
             f"delayed position is {format_ratio(horizon_sigma_ratio)} times σ, so EKF2 is "
             "consistent. The output predictor adds a lag error to the published position."
@@ -484,12 +489,12 @@ def _explain_differing_verdicts(
 ) -> str:
     filters_affected_by_fault = {
         "ekf2" if rerun.is_prediction else "kf"
-        for cause in causes[:1]
-        for rerun in cause.reruns
+        for rerun in (causes[0].reruns if causes else ())
         if rerun.improves == "position and σ"
     }
     filters_with_differing_ratios = [
         source.filter
+        # verdicts of each filter: first against the source, then against ground truth
         for source, truth in zip(sigma_verdicts[::2], sigma_verdicts[1::2], strict=True)
         if source.ratio is not None
         and truth.ratio is not None
@@ -545,21 +550,15 @@ def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCau
             f"{difference_text}. {fault_text} affects both KF and EKF2, so the difference "
             "KF − EKF2 hardly shows the fault."
         )
-    rerun_difference_by_filter_m = {
-        rerun.filter: rerun.after.difference_rms_m for rerun in reversed(reruns)
-    }
-    is_only_ekf2_corrected = {"ekf2"} in (
-        filters_affected_by_fault,
-        rerun_difference_by_filter_m.keys(),
-    )
-    rerun_difference_rms_m = rerun_difference_by_filter_m.get(
-        "ekf2" if is_only_ekf2_corrected else "kf"
-    )
-    if rerun_difference_rms_m is None:
-        return f"{difference_text}."
-    corrected_filter = "EKF2 (replay)" if is_only_ekf2_corrected else "KF"
-    rerun_text = f"{format_metres(rerun_difference_rms_m)} m after correcting {corrected_filter}"
-    return f"{difference_text}; {rerun_text}."
+    corrected_filter: FilterName = "kf"
+    if filters_affected_by_fault == {"ekf2"} or all(rerun.filter == "ekf2" for rerun in reruns):
+        corrected_filter = "ekf2"
+    for rerun in reruns:  # the best re-run first
+        rms_m = rerun.after.difference_rms_m
+        if rerun.filter == corrected_filter and rms_m is not None:
+            label = {"kf": "KF", "ekf2": "EKF2 (replay)"}[corrected_filter]
+            return f"{difference_text}; {format_metres(rms_m)} m after correcting {label}."
+    return f"{difference_text}."
 
 
 def _make_notes(cause_findings: Sequence[Finding], log_name: str) -> tuple[Note, ...]:
@@ -597,9 +596,11 @@ def _describe_kf_settings(
         )
         default_text = f"{default:g}"
         value_origin = "default" if value == default else "set by the user"
+        # the default of SIGMA_Z for GNSS is EKF2's noise parameter
         if name == "sigma_z_m" and analysis.source.origin.is_gnss:
             default_text = f"from {find_aid(analysis).noise}"
-            value_origin = default_text if chosen is None else value_origin
+            if chosen is None:
+                value_origin = default_text
         setting_texts.append(f"{SETTING_RANGES[name].format_value(value)} ({value_origin})")
         if chosen is not None and f"{chosen:g}" != default_text:
             option = f"{COMPARISON_OPTIONS[name]} {chosen:g}"

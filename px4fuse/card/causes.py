@@ -1,8 +1,8 @@
 """Rank the possible causes of a fault by re-runs of KF and EKF2, and choose actions."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from typing import NamedTuple
 
 from msgspec import structs
 
@@ -87,31 +87,27 @@ class RankedCause(NamedTuple):
 
 def rank_causes(analysis: Analysis, cause_findings: Sequence[Finding]) -> list[RankedCause]:
     """Sort errors and warnings by importance; omit findings whose re-runs have no effect."""
-    ranked_causes = []
+    # findings that only repeat the verdict on a filter name no cause: they are the last resort
+    causes, repeated_verdicts = list[RankedCause](), list[RankedCause]()
     for finding in cause_findings:
         if finding.severity == "note":
             continue
         reruns = find_reruns_of_finding(analysis.select_main_reruns(), finding)
-        if FINDING_CATALOGUE[finding.id].verdict == "repeated":
+        is_repeated_verdict = FINDING_CATALOGUE[finding.id].verdict == "repeated"
+        if is_repeated_verdict:
             reruns = tuple(filter(may_improve_filter, reruns))
-        elif reruns and not any(
-            has_effect(rerun) or not can_show_effect(rerun) for rerun in reruns
-        ):
+        elif reruns and all(can_show_effect(rerun) and not has_effect(rerun) for rerun in reruns):
             continue
         log_sigma_ratio_reduction = sum(map(compute_sigma_ratio_improvement, reruns))
         rank = _find_cause_rank(finding, reruns)
-        ranked_causes.append(RankedCause(finding, rank, log_sigma_ratio_reduction, reruns))
-    causes_except_repeated_verdicts = [
-        cause
-        for cause in ranked_causes
-        if FINDING_CATALOGUE[cause.finding.id].verdict != "repeated"
-    ]
+        ranked_cause = RankedCause(finding, rank, log_sigma_ratio_reduction, reruns)
+        (repeated_verdicts if is_repeated_verdict else causes).append(ranked_cause)
     return sorted(
-        causes_except_repeated_verdicts or ranked_causes,
+        causes or repeated_verdicts,
         key=lambda cause: (
             cause.rank,
             # faults of the source first: a changed setting may only hide them
-            cause.rank in (1, 2, 3) and _is_setting_fault(cause.finding),
+            0 < cause.rank < 4 and _is_setting_fault(cause.finding),
             -cause.log_sigma_ratio_reduction,
         ),
     )
@@ -229,39 +225,55 @@ def _make_actions(
         }
         delay_action = make_parameter_action(analysis, delay_parameter_values)
         if offset_rerun:
-            actions, alternative_action_groups = [], (tuple(actions), (delay_action,))
+            alternative_action_groups = tuple(actions), (delay_action,)
+            actions = []
         else:
             actions = [delay_action]
     elif not offset_rerun and _is_setting_fault(finding) and ranked_cause.reruns:
-        actions = []
-    for (filter_name, kind), rerun in rerun_by_filter_and_kind.items():
-        change = dict(rerun.change)
-        if filter_name == "ekf2":
+        actions = []  # only the settings are wrong
+    actions += _make_setting_actions(analysis, useful_reruns, request)
+    # Actions on the vehicle first, actions on KF last
+    actions.sort(key=lambda action: action.target == "KF")
+    action_targets = {
+        action.target for group in (actions, *alternative_action_groups) for action in group
+    }
+    actions += _explain_missing_actions(finding, action_targets, sigma_verdicts)
+    return alternative_action_groups, tuple(actions)
+
+
+def _make_setting_actions(
+    analysis: Analysis, reruns: Iterable[Rerun], request: ComparisonRequest
+) -> Iterator[Action]:
+    """Yield the changes of EKF2 parameters and KF options that the re-runs tested."""
+    for rerun in reruns:
+        (kind,), change = rerun.kinds, dict(rerun.change)
+        if rerun.filter == "ekf2":
             change = {name: value for name, value in change.items() if name in MODEL_PARAMETERS}
             if change and kind != "delay":
-                actions.append(make_parameter_action(analysis, change))
+                yield make_parameter_action(analysis, change)
         elif kind != "defaults" and change.keys() <= COMPARISON_OPTIONS.keys():
             # --clock-offset replaces the offset from the alignment, so it must include that offset
             if TIME_OFFSET_KEY in change and (alignment := analysis.source.alignment):
                 total_s = change[TIME_OFFSET_KEY] + alignment.clock_offset_s
                 change[TIME_OFFSET_KEY] = round(total_s, 3)
             command = command_line(structs.replace(request, **change))
-            actions.append(Action("KF", "", (command,), "shell"))
-    # Actions on the vehicle first, actions on KF last
-    actions.sort(key=lambda action: action.target == "KF")
-    action_targets = {
-        action.target for group in (actions, *alternative_action_groups) for action in group
-    }
-    reason_by_filter = {
-        target: reason
+            yield Action("KF", "", (command,), "shell")
+
+
+def _explain_missing_actions(
+    finding: Finding, action_targets: Set[ActionTarget], sigma_verdicts: Sequence[Verdict]
+) -> list[Action]:
+    """Explain why the settings of a filter need no change."""
+    actions = [
+        Action(target, reason)
         for filter_name, target in TARGET_BY_ADJUSTABLE_FILTER.items()
         if target not in action_targets
         and (reason := _explain_missing_action(finding, filter_name, sigma_verdicts))
-    }
-    if len(reason_by_filter) == 2 and len(set(reason_by_filter.values())) == 1:
-        reason_by_filter = {"KF, EKF2": reason_by_filter["KF"]}
-    actions += [Action(target, reason) for target, reason in reason_by_filter.items()]
-    return alternative_action_groups, tuple(actions)
+    ]
+    reasons = [action.sentence for action in actions]
+    if len(reasons) == 2 and reasons[0] == reasons[1]:
+        return [Action("KF, EKF2", reasons[0])]
+    return actions
 
 
 def _make_sender_actions(
@@ -272,9 +284,10 @@ def _make_sender_actions(
 ) -> list[Action]:
     """Return the action on the position source, or on the delay of GNSS in EKF2."""
     finding, source, model = ranked_cause.finding, analysis.source, analysis.ekf2_model
-    # users cannot shift the timestamps of a GNSS receiver
+    # users cannot shift the timestamps of a GNSS receiver, so they use the remedy of the finding
     if offset_rerun and not (source.origin.is_gnss and finding.remedy):
         shift_s = offset_rerun.change[TIME_OFFSET_KEY]
+        # the change of KF includes the clock offset of this analysis
         if offset_rerun.filter == "kf":
             shift_s -= analysis.settings.clock_offset_s
         return [Action("sender", lowercase_first_letter(format_sender_action(source, shift_s)))]
@@ -352,20 +365,28 @@ def make_parameter_action(analysis: Analysis, change: Mapping[str, float]) -> Ac
 
 def _make_card_rerun(rerun: Rerun) -> CardRerun:
     before, after = rerun.before, rerun.after
-    values_before_and_after: dict[str, Any] = {
-        f"{reference}_ratio": tuple(ratios) for reference, *ratios in compare_sigma_ratios(rerun)
+    ratios_by_reference = {
+        reference: (ratio_before, ratio_after)
+        for reference, ratio_before, ratio_after in compare_sigma_ratios(rerun)
     }
-    values_before_and_after["position_rmse_m"] = before.position_rmse_m, after.position_rmse_m
-    rejected_fractions = before.rejected_fraction, after.rejected_fraction
-    if max(fraction or 0.0 for fraction in rejected_fractions) >= MIN_REJECTED_FRACTION_TO_SHOW:
-        values_before_and_after["rejected_fraction"] = rejected_fractions
+    rejected_fractions = _pair_known(before.rejected_fraction, after.rejected_fraction)
+    if rejected_fractions and max(rejected_fractions) < MIN_REJECTED_FRACTION_TO_SHOW:
+        rejected_fractions = None
     return CardRerun(
         label=_format_rerun_label(rerun),
         is_prediction=rerun.filter == "ekf2",
         from_s=rerun.from_s,
+        position_rmse_m=_pair_known(before.position_rmse_m, after.position_rmse_m),
+        source_ratio=ratios_by_reference.get("source"),
+        truth_ratio=ratios_by_reference.get("truth"),
+        rejected_fraction=rejected_fractions,
         improves=classify_improvement(rerun),
-        **{name: pair for name, pair in values_before_and_after.items() if None not in pair},
     )
+
+
+def _pair_known(before: float | None, after: float | None) -> tuple[float, float] | None:
+    """Return both values, or None if one of them is unknown."""
+    return None if before is None or after is None else (before, after)
 
 
 def _format_rerun_label(rerun: Rerun) -> str:

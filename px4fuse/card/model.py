@@ -115,8 +115,12 @@ class Action(Record):
     commands: tuple[str, ...] = ()
     where: Literal["shell", "console", ""] = ""
 
+    @property
+    def keeps_settings(self) -> bool:
+        return self.sentence.startswith("keep the settings")
+
     def changes_something(self) -> bool:
-        return not self.sentence.startswith(("no ", "keep the settings"))
+        return not (self.keeps_settings or self.sentence.startswith("no "))
 
 
 class CardRerun(Record, kw_only=True):

@@ -210,7 +210,8 @@ def _make_schema(parameter: click.Parameter) -> dict[str, Any]:
     if isinstance(value_type, click.Choice):
         schema = {"enum": [*value_type.choices]}
     elif isinstance(value_type, options.NumberWithUnit):
-        schema = {"anyOf": [{"type": "number"}, {"const": "auto"}][: 1 + value_type.accepts_auto]}
+        number = {"type": "number"}
+        schema = {"anyOf": [number, {"const": "auto"}]} if value_type.accepts_auto else number
     elif isinstance(value_type, click.IntRange):
         schema = {"type": "integer"}
     elif getattr(parameter, "is_flag", False):
@@ -240,17 +241,20 @@ def _parse_arguments(
         if name not in arguments:
             continue
         value, option = arguments[name], parameter.opts[-1]
-        if isinstance(value, dict):
+        if value is False:
+            continue
+        if value is True:
+            command_words.append(option)
+            continue
+        if isinstance(value, dict):  # NAME=VALUE of px4fuse whatif --set
             value = [f"{key}={number}" for key, number in value.items()]
-        argument_texts = [str(text) for text in (value if isinstance(value, list) else [value])]
-        if isinstance(parameter.type, options.InputPath):
-            argument_texts = [_find_file(argument_texts[0], folders)]
+        elif isinstance(parameter.type, options.InputPath):
+            value = _find_file(value, folders)
+        texts = value if isinstance(value, list) else [value]
         if isinstance(parameter, click.Argument):
-            operands += argument_texts
-        elif isinstance(value, bool):
-            command_words += [option] * value
+            operands += texts
         else:
-            command_words += [f"{option}={text}" for text in argument_texts]
+            command_words += [f"{option}={text}" for text in texts]
     return command_words + operands
 
 

@@ -247,6 +247,7 @@ def make_result_files(
     if default_stem and output is None and json_path is None:
         output = choose_default_report_path(default_stem, results)
     json_text, contents = to_json(results), dict[Path, bytes]()
+    # px4fuse mcp takes the results from the context, so that standard output is text only
     if (recorded_texts := click.get_current_context().meta.get(RESULTS_KEY)) is not None:
         recorded_texts.append(json_text)
         json_path = None if json_path == STANDARD_OUTPUT else json_path

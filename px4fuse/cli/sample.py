@@ -20,15 +20,14 @@ def sample_log() -> Path:
     MissingDataError
         The sample logs are not installed.
     """
-    from importlib.resources import as_file, files
+    from importlib.resources import files
 
     from px4fuse.errors import MissingDataError
 
     path = SAMPLES_FOLDER / SAMPLE_LOG
     if not path.is_file():
         try:
-            with as_file(files("px4fuse_samples") / SAMPLE_LOG) as path:
-                pass
+            path = Path(str(files("px4fuse_samples") / SAMPLE_LOG))
         except ModuleNotFoundError:
             raise MissingDataError(
                 "No log was given, and the sample logs are not installed.",

@@ -135,9 +135,12 @@ def _draw_flight(rng: np.random.Generator, right_answer: str, level: int) -> Qui
 
     faults = draw_one_fault([fault for fault in QUIZ_FAULTS if fault.choice == right_answer])
     if level == MAX_QUIZ_LEVEL and faults and rng.random() < 0.5:
-        faults_and_answers = ((fault, {fault.choice, right_answer}) for fault in QUIZ_FAULTS)
         faults += draw_one_fault(
-            [fault for fault, pair in faults_and_answers if pair in COMBINABLE_ANSWER_PAIRS]
+            [
+                fault
+                for fault in QUIZ_FAULTS
+                if {fault.choice, right_answer} in COMBINABLE_ANSWER_PAIRS
+            ]
         )
     faults_and_sizes, sigma_uwb_m = [], SIGMA_Z_M
     for fault in faults:
@@ -163,15 +166,14 @@ def make_practice_page(
 
     ``progress`` is called with a text, the number of finished flights, and the number of flights.
     """
-    html_by_flight = []
-    data: dict[str, Any] = {}
+    flights_html = ""
     for flight_index, practice_flight in enumerate(choose_random_flights(seed, level, count)):
         progress(f"flight {flight_index + 1}", flight_index, count)
         data, flight_html = _simulate_flight_data(practice_flight, flight_index)
-        html_by_flight.append(flight_html)
+        flights_html += flight_html
     return make_page_html(
-        data,
-        data_scripts="\n".join(html_by_flight),
+        data,  # of the last flight: the plots and axes of all flights are the same
+        data_scripts=flights_html,
         command="practice",
         title="simulated flights with known faults",
         about=f"seed {seed}, level {level}",
@@ -183,7 +185,9 @@ def make_practice_page(
 def _simulate_flight_data(
     practice_flight: QuizFlight, flight_index: int
 ) -> tuple[dict[str, Any], str]:
+    """Return the data of a flight, and HTML elements with the data and the answers."""
     faults_and_sizes = practice_flight.faults_and_sizes
+    # the scenario already contains the noisy UWB
     fault_options = [
         f"{fault.name}={size}" for fault, size in faults_and_sizes if fault.name != NOISY_UWB_FAULT
     ]
@@ -192,6 +196,7 @@ def _simulate_flight_data(
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
     # without the automatic correction of axes and timestamps, which would hide the injected fault
     prepared = prepare_comparison_inputs(flight, request, keep_positions_as_sent=True)
+    # with the request, from which the page makes its command
     analysis = replace(diagnose_comparison(compare(prepared)), request=request)
     fault_descriptions = [_describe_fault(*pair, analysis.findings) for pair in faults_and_sizes]
     card = _with_fault_headline(build_card(analysis, request), fault_descriptions)

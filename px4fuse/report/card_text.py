@@ -96,6 +96,7 @@ class Paragraph(NamedTuple):
     plot: str = ""
 
     def wrap(self, width: int) -> list[str]:
+        """Split the paragraph into lines; a paragraph with a plot is one line."""
         if self.wrap_indent is not None:
             lines = list[str]()
             for sentence in SENTENCE_END_PATTERN.split(self.text):
@@ -110,6 +111,7 @@ class Paragraph(NamedTuple):
             return lines
         if not self.plot or len(self.text) + len(self.plot) <= width:
             return [self.text + self.plot]
+        # too narrow for the plot
         return [self.text.rstrip()] if self.text.strip() else []
 
 
@@ -329,12 +331,6 @@ def _format_action_lines(label: str, label_width: int, action: Action) -> Iterat
 
 def _format_rerun_table(reruns: Sequence[CardRerun]) -> Iterator[Paragraph]:
     rows = make_rerun_rows(reruns)
-    for row in rows[1:]:
-        # Each cell begins with the first word or symbol of its heading
-        row[1:-1] = [
-            f"{heading.removeprefix('position ').split()[0]} {cell}" if cell else ""
-            for heading, cell in zip(rows[0][1:-1], row[1:-1], strict=True)
-        ]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
@@ -395,9 +391,11 @@ def _format_verdict_lines(card: DiagnosisCard) -> Iterator[Paragraph]:
     heading = f"Consistency{direction_text}: RMS of error ÷ reported σ (expected 1)"
     yield Paragraph(heading, "", "  ")
     legend = f"  ░ consistent ({format_consistent_ratios()})"
+    left_end, right_end = "← reported σ too large", "too small →"
+    # the plot has 8 more characters than its axis: the labels of the ends
+    right_end_width = SIGMA_RATIO_AXIS_WIDTH + 8 - len(left_end)
     yield Paragraph(
-        f"{'':{SIGMA_RATIO_AXIS_INDENT}}",
-        plot=f"← reported σ too large{'too small →':>{SIGMA_RATIO_AXIS_WIDTH - 14}}",
+        f"{'':{SIGMA_RATIO_AXIS_INDENT}}", plot=f"{left_end}{right_end:>{right_end_width}}"
     )
     yield Paragraph(f"{legend:{SIGMA_RATIO_AXIS_INDENT}}", plot=_format_tick_labels())
     if any(verdict.is_explained for verdict in card.verdicts):

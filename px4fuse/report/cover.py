@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,7 +22,7 @@ from px4fuse.comparison.comparison import (
     compute_position_errors,
     interpolate_sigma,
 )
-from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, select_north_and_east
+from px4fuse.comparison.model import FILTER_NAMES, select_north_and_east
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres, format_ratio, shorten_to_line
 from px4fuse.filter.consistency import Reference
@@ -46,10 +46,7 @@ from px4fuse.report.card_text import (
 from px4fuse.report.page import (
     AXES_LEFT_MARGIN,
     AXES_RIGHT_MARGIN,
-    LABELLED_BOTTOM_MARGIN,
-    UNLABELLED_BOTTOM_MARGIN,
     Page,
-    PageBlock,
     make_columns,
 )
 from px4fuse.report.panels import (
@@ -60,8 +57,7 @@ from px4fuse.report.panels import (
     draw_dots,
     normalised_innovations,
 )
-from px4fuse.report.style import SEVERITY_COLOURS, TRACK_STYLES, Axes, draw_curve
-from px4fuse.report.typesetting import measure_free_height
+from px4fuse.report.style import SEVERITY_COLOURS, TRACK_STYLES, draw_curve
 from px4fuse.results.contract import AidsResults, ComparisonResults
 
 FlightResults = ComparisonResults | AidsResults
@@ -76,15 +72,7 @@ AIDS_TERMS_NOTE = (
     "√S: standard deviation of an innovation as EKF2 reports it. Source: a sensor that aids EKF2."
 )
 ALL_FINDINGS_TITLE = "All findings"
-# Tracks with a larger ratio of length to width can have a map of full page width
-MIN_LENGTH_TO_WIDTH_RATIO_OF_WIDE_MAP = 2.2
-MIN_WIDE_MAP_HEIGHT = 95.0  # points
-MAP_HEIGHT_FRACTION = 0.33  # of the height of all plots
-# With less free height (points) on the first page, the plots are on the next page
-MIN_PLOTS_HEIGHT = 190.0
-NEXT_PAGE_PLOTS_HEIGHT = 450.0  # points, of all plots on the next page
-UNUSED_PAGE_HEIGHT = 32.0  # points, for gaps, and for a second line of a title
-TITLE_HEIGHT = 18.5  # points, of a title above a plot
+MAP_HEIGHT, PLOT_HEIGHT = 190.0, 50.0  # points, of the map and of each plot beside the map
 MAX_DRAWN_SIGMAS = 4.0  # larger innovations ÷ √S are triangles at the edge
 MAP_MARGIN_FACTOR = 1.08  # extent of the map divided by the extent of the tracks
 # Maximum margin of the map, as fraction of the extent of the positions
@@ -96,42 +84,31 @@ SigmaByFilter = Mapping[str, "pd.Series[float]"]
 def draw_pages(analysis: Analysis | AidingSourceAnalysis, results: FlightResults) -> Iterator[Page]:
     """Draw the first page: the diagnosis card with plots below."""
     page = Page()
-    block = add_card(page, results.card)
+    add_card(page, results.card)
     if isinstance(analysis, Analysis):
-        write_panels(block, analysis, results.card, measure_free_height(page))
+        write_panels(page, analysis, results.card)
     yield page
 
 
-def add_card(page: Page, card: DiagnosisCard) -> PageBlock:
+def add_card(page: Page, card: DiagnosisCard) -> None:
     """Add a diagnosis card (faults, causes and actions) to a page."""
     direction_text = f", {card.effect.axis}" if card.effect else ""
     ratio_text = f"RMS of actual error ÷ reported σ{direction_text}"
-    return page.add(
-        "cover",
-        identity=structs.asdict(card.identity),
-        headline=card.headline,
-        effect=card.effect_text,
-        do_this=card.do_this,
-        facts=card.facts,
-        reconcile=card.reconcile,
-        difference=card.difference,
-        more_causes=card.more_causes,
-        sign=SEVERITY_SIGNS[card.severity],
-        colour=SEVERITY_COLOURS[card.severity],
-        file=shorten_to_line(card.identity.file, MAX_FILE_NAME_LENGTH),
-        flight=" · ".join(list_flight_texts(card)),
-        axis_text=AIDS_CAPTION if card.aids else ratio_text,
-        axis_legend=(
-            f"grey: ratio of a consistent filter ({format_consistent_ratios()}) · ━ 95 % interval "
-            "· ◀ ▶: ratio outside the axis"
-        ),
-        ticks=[(map_ratio_to_axis(tick), label) for tick, label in RATIO_AXIS_TICKS.items()],
-        rows=[*map(_make_verdict_row, card.verdicts), *map(_make_aid_row, card.aids)],
-        causes=list(map(_make_cause_fields, card.causes)),
-        notes=format_notes(card),
-        terms=AIDS_TERMS_NOTE if card.aids else TERMS_NOTE,
-        blocks=[],
-    )
+    formatted_fields = {
+        "sign": SEVERITY_SIGNS[card.severity],
+        "colour": SEVERITY_COLOURS[card.severity],
+        "file": shorten_to_line(card.identity.file, MAX_FILE_NAME_LENGTH),
+        "flight": " · ".join(list_flight_texts(card)),
+        "axis_text": AIDS_CAPTION if card.aids else ratio_text,
+        "axis_legend": f"grey: ratio of a consistent filter ({format_consistent_ratios()}) · ━ 95 "
+        "% interval · ◀ ▶: ratio outside the axis",
+        "ticks": [(map_ratio_to_axis(tick), label) for tick, label in RATIO_AXIS_TICKS.items()],
+        "rows": [*map(_make_verdict_row, card.verdicts), *map(_make_aid_row, card.aids)],
+        "causes": list(map(_make_cause_fields, card.causes)),
+        "notes": format_notes(card),
+        "terms": AIDS_TERMS_NOTE if card.aids else TERMS_NOTE,
+    }
+    page.add("cover", **structs.asdict(card) | formatted_fields)
 
 
 def _make_verdict_row(verdict: Verdict) -> dict[str, Any]:
@@ -177,11 +154,8 @@ def _make_ratio_row(
 
 
 def _make_cause_fields(cause: DiagnosedCause) -> dict[str, Any]:
-    return {
-        "title": cause.title,
-        "id": cause.id,
+    formatted_fields = {
         "when": f"{cause.severity} · {format_spans(cause.spans_s) or 'whole flight'}",
-        "why": cause.why,
         "actions": [
             structs.asdict(action) | {"label": f"{prefix}{action.target}"}
             for prefix, action in label_alternatives(cause)
@@ -189,63 +163,22 @@ def _make_cause_fields(cause: DiagnosedCause) -> dict[str, Any]:
         "reruns": make_rerun_rows(cause.reruns),
         "after": " ".join(filter(None, (format_rerun_note(cause.reruns), cause.after))),
     }
+    return structs.asdict(cause) | formatted_fields
 
 
-class TimePlot(NamedTuple):
-    """Plot over time: title, and function that draws the plot."""
-
-    title: str
-    draw: Callable[[Axes], None]
-
-
-def write_panels(
-    block: PageBlock, analysis: Analysis, card: DiagnosisCard, free_height: float
-) -> None:
-    """Draw legend, map and plots over time on the first page."""
-    page = Page()
-    block["blocks"] = page.blocks
-    legend = add_legend(page, analysis)
-    plots = [*_make_error_plots(analysis, card), _make_innovation_plot(analysis.main)]
-    tracks, map_labels = _rotate_map_tracks(analysis)
-    plots_height = free_height - legend["height"] - UNUSED_PAGE_HEIGHT
-    if plots_height < MIN_PLOTS_HEIGHT:
-        plots_height = NEXT_PAGE_PLOTS_HEIGHT
-        page.blocks.insert(0, {"kind": "break"})
-    length_m, width_m = np.ptp(tracks["positions"], axis=1)
-    map_height = MAP_HEIGHT_FRACTION * plots_height
-    if (
-        length_m > MIN_LENGTH_TO_WIDTH_RATIO_OF_WIDE_MAP * width_m
-        and map_height > MIN_WIDE_MAP_HEIGHT
-    ):
-        _draw_map(page, analysis, tracks, map_labels, map_height)
-        _draw_plots(page, analysis, plots, plots_height - map_height)
-        return
-    left_column, right_column = make_columns()
-    _draw_map(left_column, analysis, tracks, map_labels, plots_height)
-    _draw_plots(right_column, analysis, plots, plots_height)
-    page.add_columns(left_column, right_column)
+def write_panels(page: Page, analysis: Analysis, card: DiagnosisCard) -> None:
+    """Draw map, position errors and innovations, together on the first or on the second page."""
+    section, (left_column, right_column) = Page(), make_columns()
+    add_legend(section, analysis)
+    _draw_map(left_column, analysis)
+    _draw_error_plots(right_column, analysis, card)
+    _draw_innovations(right_column, analysis)
+    section.add_columns(left_column, right_column)
+    page.add_columns(section)
 
 
-def _draw_plots(
-    page: Page, analysis: Analysis, plots: Sequence[TimePlot], total_height: float
-) -> None:
-    """Draw plots over time with axes of equal height."""
-    axes_height = (total_height - LABELLED_BOTTOM_MARGIN + UNLABELLED_BOTTOM_MARGIN) / len(
-        plots
-    ) - (TITLE_HEIGHT + UNLABELLED_BOTTOM_MARGIN)
-    for plot in plots:
-        axes = add_time_panel(
-            page,
-            analysis,
-            plot.title,
-            axes_height,
-            with_time_label=plot is plots[-1],
-        )
-        plot.draw(axes)
-
-
-def _make_error_plots(analysis: Analysis, card: DiagnosisCard) -> list[TimePlot]:
-    """Return plots of the position errors of KF and EKF2, or of their difference."""
+def _draw_error_plots(page: Page, analysis: Analysis, card: DiagnosisCard) -> None:
+    """Draw the position errors of KF and EKF2, or their difference."""
     result, effect = analysis.main.with_whole_flight_tracks(), card.effect
     plots: list[tuple[str, float | None, pd.Series[float], SigmaByFilter]] = []
     for filter_name, label in FILTER_NAMES.items():
@@ -269,7 +202,8 @@ def _make_error_plots(analysis: Analysis, card: DiagnosisCard) -> list[TimePlot]
         (_compute_error_axis_limit_m(error_m, sigmas_m) for _, _, error_m, sigmas_m in plots),
         default=0.0,
     )
-    return [_make_error_plot(*plot, half_range_m) for plot in plots]
+    for plot in plots:
+        _draw_error_plot(page, analysis, *plot, half_range_m)
 
 
 def _compute_error_axis_limit_m(error_m: pd.Series[float], sigmas_m: SigmaByFilter) -> float:
@@ -279,13 +213,15 @@ def _compute_error_axis_limit_m(error_m: pd.Series[float], sigmas_m: SigmaByFilt
     return float(np.nanmax([largest_error_m, *np.minimum(sigma_limits_m, 3.0 * largest_error_m)]))
 
 
-def _make_error_plot(
+def _draw_error_plot(
+    page: Page,
+    analysis: Analysis,
     title: str,
     rms_m: float | None,
     error_m: pd.Series[float],
     sigmas_m: SigmaByFilter,
     half_range_m: float,
-) -> TimePlot:
+) -> None:
     known_sigmas_m = {
         name: sigma.dropna() for name, sigma in sigmas_m.items() if sigma.notna().any()
     }
@@ -300,36 +236,24 @@ def _make_error_plot(
         else TRACK_STYLES[next(iter(sigmas_m))]
     )
 
-    def draw(axes: Axes) -> None:
-        axes.set_ylim(-half_range_m, half_range_m)
-        for name, sigma in known_sigmas_m.items():
-            style.draw_sigma_band(axes, 0.0 * sigma, sigma, style.SIGMA_BAND_COLOURS[name])
-        style.draw_zero_line(axes)
-        draw_curve(axes, error_m, **line)
-
-    return TimePlot(title, draw)
+    axes = add_time_panel(page, analysis, title, PLOT_HEIGHT, with_time_label=False)
+    axes.set_ylim(-half_range_m, half_range_m)
+    for name, sigma in known_sigmas_m.items():
+        style.draw_sigma_band(axes, 0.0 * sigma, sigma, style.SIGMA_BAND_COLOURS[name])
+    style.draw_zero_line(axes)
+    draw_curve(axes, error_m, **line)
 
 
-def _make_innovation_plot(result: AxisComparison) -> TimePlot:
-    innovations = normalised_innovations(result)
+def _draw_innovations(page: Page, analysis: Analysis) -> None:
+    innovations = normalised_innovations(analysis.main)
     legend = ", ".join(f"{style.INNOVATION_SYMBOLS[name]} {name}" for name in innovations)
-    title = f"Innovations ÷ √S ({legend}): 95 % expected within ±2"
-    clipped_value_texts = [
-        f"{name} {format_ratio(ratio)}"
-        for name, values in innovations.items()
-        if (ratio := float(values.abs().max())) > MAX_DRAWN_SIGMAS
-    ]
-    if clipped_value_texts:
-        title += f"; ▲▼ beyond ±{MAX_DRAWN_SIGMAS:g}, largest {', '.join(clipped_value_texts)}"
-
-    def draw(axes: Axes) -> None:
-        axes.set(ylim=(-1.12 * MAX_DRAWN_SIGMAS, 1.12 * MAX_DRAWN_SIGMAS), yticks=(-2.0, 2.0))
-        axes.axhspan(-2.0, 2.0, color=style.CONSISTENT_BAND_COLOUR, lw=0, zorder=0.05)
-        style.draw_zero_line(axes)
-        for name in reversed(innovations):
-            draw_dots(axes, innovations[name], MAX_DRAWN_SIGMAS, style.INNOVATION_STYLES[name])
-
-    return TimePlot(title, draw)
+    title = f"Innovations ÷ √S ({legend}): 95 % expected within ±2; ▲▼ beyond ±{MAX_DRAWN_SIGMAS:g}"
+    axes = add_time_panel(page, analysis, title, PLOT_HEIGHT)
+    axes.set(ylim=(-1.12 * MAX_DRAWN_SIGMAS, 1.12 * MAX_DRAWN_SIGMAS), yticks=(-2.0, 2.0))
+    axes.axhspan(-2.0, 2.0, color=style.CONSISTENT_BAND_COLOUR, lw=0, zorder=0.05)
+    style.draw_zero_line(axes)
+    for name in reversed(innovations):
+        draw_dots(axes, innovations[name], MAX_DRAWN_SIGMAS, style.INNOVATION_STYLES[name])
 
 
 def _rotate_map_tracks(analysis: Analysis) -> tuple[dict[str, Array], tuple[str, str]]:
@@ -364,12 +288,8 @@ def _select_map_tracks(analysis: Analysis) -> dict[str, Array]:
         return flight_samples[["north_m", "east_m"]].to_numpy().T
 
     tracks = {"positions": cut_to_flight(analysis.source.samples)}
-    for name, label in FILTER_NAMES.items():
-        positions_m = [
-            run.steps["position_m"] for result in results if (run := result.tracks[name].run)
-        ]
-        if len(positions_m) == 2:
-            tracks[label] = np.array(positions_m)
+    if len(results) == 2:
+        tracks["KF"] = np.array([result.kf_run.steps["position_m"] for result in results])
     if isinstance(flight.ekf2, Ekf2):
         tracks["EKF2"] = cut_to_flight(flight.ekf2.state)
     if isinstance(flight.truth, Truth):
@@ -377,16 +297,10 @@ def _select_map_tracks(analysis: Analysis) -> dict[str, Array]:
     return {name: track for name, track in tracks.items() if track.size}
 
 
-def _draw_map(
-    page: Page,
-    analysis: Analysis,
-    tracks: Mapping[str, Array],
-    labels: tuple[str, str],
-    height: float,
-) -> None:
-    axes_height = height - TITLE_HEIGHT - LABELLED_BOTTOM_MARGIN
+def _draw_map(page: Page, analysis: Analysis) -> None:
+    tracks, axis_names = _rotate_map_tracks(analysis)
     axes_width = page.width - AXES_LEFT_MARGIN - AXES_RIGHT_MARGIN
-    limits = _compute_map_limits(tracks, axes_width / axes_height)
+    limits = _compute_map_limits(tracks, axes_width / MAP_HEIGHT)
     distance_m, name = max(
         (np.nanmax(np.abs(track.T - np.clip(track.T, *limits))), name)
         for name, track in tracks.items()
@@ -394,8 +308,8 @@ def _draw_map(
     title = "Map"
     if distance_m > 0.0:
         title += f"; {name} up to {format_metres(distance_m)} m outside the plotted area"
-    axes = page.add_panel(title, axes_height)
-    style.set_map_axes(axes, *labels)
+    axes = page.add_panel(title, MAP_HEIGHT)
+    style.set_map_axes(axes, *axis_names)
     (left, bottom), (right, top) = limits
     axes.set(xlim=(left, right), ylim=(bottom, top))
     for name, (map_x_m, map_y_m) in tracks.items():

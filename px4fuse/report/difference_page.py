@@ -58,15 +58,11 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     )
     page.add_columns(left_column, right_column)
     difference_m = pd.Series(explanation.kf_minus_ekf2_m, explanation.times_s)
-    largest_difference_row = int(np.argmax(np.abs(explanation.kf_minus_ekf2_m)))
     axes = add_time_panel(
         page,
         analysis,
         "Position difference KF - EKF2 (m): total (dark) and unexplained part (light)",
         TIME_PLOT_HEIGHT,
-        caption="Largest difference KF - EKF2: "
-        f"{abs(explanation.kf_minus_ekf2_m[largest_difference_row]):.2g} m at "
-        f"{explanation.times_s[largest_difference_row]:.1f} s.",
     )
     unexplained_difference_m = pd.Series(explanation.unexplained_difference_m, explanation.times_s)
     for start, end in explanation.spans_s:
@@ -119,9 +115,7 @@ def _draw_contributions(
     axes.barh(rows, percents, height=0.7, color=KF_BAND_COLOUR, edgecolor=KF_COLOUR, lw=0.6)
     axes.set_yticks(rows, names)
     for row, percent in enumerate(percents):
-        digits = 1 if 0.05 <= abs(percent) < 9.95 else 0
-        text = f"{percent:z.{digits}f} %"
-        axes.text(1.05 * percents.max(), row, text, va="center", size=8.0)
+        axes.text(1.05 * percents.max(), row, f"{percent:z.1f} %", va="center", size=8.0)
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.set_xlim(min(0.0, 1.1 * percents.min()), 1.5 * percents.max())
     axes.set_xlabel("% of the mean square difference")

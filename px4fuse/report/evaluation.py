@@ -37,10 +37,7 @@ def draw_pages(evaluation: Evaluation, _: object) -> Iterator[Page]:
     )
     _write_evaluation(page, evaluation)
     _draw_maps(page, evaluation)
-    left_column, right_column = make_columns()
-    _draw_ape(left_column, evaluation)
-    _draw_rpe(right_column, evaluation)
-    page.add_columns(left_column, right_column)
+    _draw_ape(page, evaluation)
     yield page
 
 
@@ -49,7 +46,7 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     frame, is_aligned = evaluation.reference_track.frame, evaluation.alignment != "none"
     axis_indices = list(MAP_AXIS_INDICES.get(frame, (0, 1)))
     names = [AXES_OF_FRAME[frame][index] for index in axis_indices]
-    left_column, right_column = make_columns()
+    left_column, right_column = columns = make_columns()
     title = f"{'Aligned path' if is_aligned else 'Path'} coloured by error"
     axes = right_column.add_panel(title, MAP_HEIGHT, right_margin=COLOUR_BAR_MARGIN)
     _draw_path(axes, evaluation, axis_indices)
@@ -61,7 +58,9 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
         f"after {evaluation.distance_m[worst_index]:.1f} m of travel."
     )
     legend_handles = axes.get_legend_handles_labels()[0]
-    if is_aligned:
+    if not is_aligned:
+        columns = [right_column]
+    else:
         axes = left_column.add_panel("Before alignment", MAP_HEIGHT)
         reference_m = evaluation.reference_position_m[:, axis_indices]
         plot_path(axes, reference_m, evaluation.time_s, **REFERENCE_LINE_STYLE)
@@ -71,7 +70,7 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
         left_column.write_muted_text(describe_unaligned_rmse(evaluation))
         legend_handles += axes.get_legend_handles_labels()[0]
     page.add_legend(legend_handles)
-    page.add_columns(*[left_column] * is_aligned, right_column)
+    page.add_columns(*columns)
 
 
 def _draw_path(axes: Axes, evaluation: Evaluation, axis_indices: list[int]) -> None:
@@ -110,26 +109,6 @@ def _draw_ape(page: Page, evaluation: Evaluation) -> None:
     axes.set_xlabel("time from the first pose (s)" if time_origin_s else "time (s)")
 
 
-def _draw_rpe(page: Page, evaluation: Evaluation) -> None:
-    rpe_statistics = [
-        (error, error.translation_m)
-        for error in evaluation.rpe
-        if isinstance(error.translation_m, Statistics)
-    ]
-    if not rpe_statistics:
-        return
-    axes = page.add_panel("RPE (m) of pose pairs at distance delta", ERROR_PLOT_HEIGHT)
-    for index, (error, statistics) in enumerate(rpe_statistics):
-        if isinstance(error.interval_m, RmseInterval):
-            axes.vlines(index, error.interval_m.low, error.interval_m.high, color=KF_COLOUR, lw=1.6)
-        axes.plot(index, statistics.rmse, "D", color=EKF2_COLOUR, mec="black", mew=0.5, ms=3.6)
-    axes.set_xticks(range(len(rpe_statistics)), [error.delta_text for error, _ in rpe_statistics])
-    axes.set_ylim(0.0, max(axes.get_ylim()[1], MIN_DRAWN_ERROR_RANGE_M))
-    axes.margins(x=0.1)
-    axes.set_xlabel("delta: distance, time or frames between poses")
-    page.write_muted_text(describe_rpe_growth(evaluation.rpe))
-
-
 def plot_path(axes: Axes, positions_m: Array, time_s: Array, **style: Any) -> None:
     """Draw a path, shape (n, 2), with its gaps in time."""
     intervals_s = np.diff(time_s)
@@ -160,12 +139,14 @@ def _write_evaluation(page: Page, evaluation: Evaluation) -> None:
     head = "error", "RMSE", "mean (m)", "median (m)", "std (m)", "max (m)", "n", "rotation RMSE (°)"
     page.add_table(head, _make_error_rows(evaluation), right_aligned_columns=range(2, len(head)))
     ate, rpe_translations = evaluation.ate, (error.translation_m for error in evaluation.rpe)
-    missing_reasons = {
-        f"No {quantity.what}: {quantity.reason}.": None
+    missing_reasons = [
+        f"No {quantity.what}: {quantity.reason}."
         for quantity in (ate.interval_m, ate.rotation_deg, *rpe_translations)
         if isinstance(quantity, Unavailable)
-    }
-    page.write_muted_text(" ".join([*missing_reasons, *evaluation.notes]))
+    ]
+    growth_text = describe_rpe_growth(evaluation.rpe)
+    notes = dict.fromkeys([*missing_reasons, *evaluation.notes, growth_text])
+    page.write_muted_text(" ".join(notes).rstrip())
 
 
 def make_evaluation_page(evaluation: Evaluation) -> Page:
@@ -232,7 +213,6 @@ def describe_unaligned_rmse(evaluation: Evaluation) -> str:
 
 def describe_rpe_growth(rpe: tuple[RelativePoseError, ...]) -> str:
     """Describe the growth of the relative pose error (RPE) with distance or time."""
-    interval_note = "RMSE with its 95 % interval."
     # Distances, times and numbers of frames cannot be compared: use the most frequent unit
     units = [error.unit for error in rpe]
     unit = max(units, key=units.count, default="")
@@ -243,18 +223,16 @@ def describe_rpe_growth(rpe: tuple[RelativePoseError, ...]) -> str:
         and translation_errors_m.rmse > NEGLIGIBLE_ERROR_M
         and error.unit == unit
     }
-    if len(rmse_by_delta) < 2:
-        return (
-            f"{interval_note} Add a second distance with --rpe: drift grows with distance, noise "
-            "does not."
-        )
-    smallest_delta, largest_delta = min(rmse_by_delta), max(rmse_by_delta)
-    rmse_ratio = rmse_by_delta[largest_delta] / rmse_by_delta[smallest_delta]
+    if not rmse_by_delta:
+        return ""
+    if len(rmse_by_delta) == 1:
+        return "Add a second distance with --rpe: drift grows with distance, noise does not."
+    smallest, largest = min(rmse_by_delta), max(rmse_by_delta)
     return (
-        f"{interval_note} From {smallest_delta:g} to {largest_delta:g} {unit} (--rpe), the RPE "
-        f"RMSE grows by a factor of {rmse_ratio:.2g}. Expected: 1 for independent noise, "
-        f"{np.sqrt(largest_delta / smallest_delta):.2g} for a random walk, "
-        f"{largest_delta / smallest_delta:.3g} for a scale or heading error."
+        f"From {smallest:g} to {largest:g} {unit} (--rpe), the RPE RMSE grows "
+        f"by a factor of {rmse_by_delta[largest] / rmse_by_delta[smallest]:.2g}. Expected: 1 for "
+        f"independent noise, {np.sqrt(largest / smallest):.2g} for a random walk, "
+        f"{largest / smallest:.3g} for a scale or heading error."
     )
 
 

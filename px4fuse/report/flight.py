@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import FILTER_NAMES, AxisComparison
+from px4fuse.comparison.model import AxisComparison
 from px4fuse.core.record import Span
 from px4fuse.report import panels, style
 from px4fuse.report.difference_page import describe_missing_explanation
@@ -16,6 +16,14 @@ from px4fuse.report.style import EKF2_COLOUR, TRACK_STYLES
 
 ZOOM_UPDATE_COUNT = 15  # in the enlarged plot of σ of position
 MIN_ZOOM_DURATION_S = 1.0  # minimum duration of the enlarged plot
+TRACK_PANELS = (panels.POSITION_PANEL, panels.VELOCITY_PANEL)
+INNOVATION_PANELS = (
+    panels.INNOVATIONS_PANEL,
+    panels.POSITION_SIGMA_PANEL,
+    panels.VELOCITY_SIGMA_PANEL,
+)
+# Panels of each axis in the appendix
+NARROW_PANELS = (*TRACK_PANELS, *INNOVATION_PANELS[:2])
 ENLARGED_PLOT_HEIGHT = 125.0  # points
 
 
@@ -24,8 +32,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     result = analysis.main
     page = Page(f"Position and velocity along {result.axis.label}")
     panels.add_legend(page, analysis)
-    panels.POSITION_PANEL.draw_on_page(page, analysis, result, with_time_label=False)
-    panels.VELOCITY_PANEL.draw_on_page(page, analysis, result, with_time_label=True)
+    panels.draw_panels(page, analysis, result, TRACK_PANELS)
     page.write(describe_missing_explanation(analysis))
     yield page
 
@@ -34,9 +41,7 @@ def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw innovations and σ along the axis of largest motion over time."""
     result = analysis.main
     page = Page(f"Innovations and variances along {result.axis.label}")
-    panels.INNOVATIONS_PANEL.draw_on_page(page, analysis, result, with_time_label=False)
-    panels.POSITION_SIGMA_PANEL.draw_on_page(page, analysis, result, with_time_label=False)
-    panels.VELOCITY_SIGMA_PANEL.draw_on_page(page, analysis, result, with_time_label=True)
+    panels.draw_panels(page, analysis, result, INNOVATION_PANELS)
     _draw_enlarged_sigma_plot(page, result)
     for note in list_verdict_warnings(analysis):
         page.write_muted_text(note)
@@ -48,15 +53,13 @@ def _draw_enlarged_sigma_plot(page: Page, result: AxisComparison) -> None:
     start_s, end_s = find_zoom_span(result)
     title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
     axes = page.add_panel(title, ENLARGED_PLOT_HEIGHT, caption=_describe_sigma_at_updates(result))
-    ekf2 = result.ekf2_tracks
-    for name, tracks in result.tracks.items():
-        if run := tracks.run:
-            variances_m2 = pd.concat(
-                [run.updates["prior_position_variance_m2"], run.steps["position_variance_m2"]]
-            )
-            # A stable sort keeps the prior variance before the posterior variance
-            variances_m2 = variances_m2.sort_index(kind="stable").loc[start_s:end_s]
-            axes.plot(np.sqrt(variances_m2), **TRACK_STYLES[FILTER_NAMES[name]])
+    kf_run, ekf2 = result.kf_run, result.ekf2_tracks
+    kf_variances_m2 = pd.concat(
+        [kf_run.updates["prior_position_variance_m2"], kf_run.steps["position_variance_m2"]]
+    )
+    # A stable sort keeps the prior variance before the posterior variance
+    kf_variances_m2 = kf_variances_m2.sort_index(kind="stable").loc[start_s:end_s]
+    axes.plot(np.sqrt(kf_variances_m2), **TRACK_STYLES["KF"])
     if isinstance(ekf2.innovations, pd.DataFrame):
         ekf2_updates = ekf2.innovations.loc[start_s:end_s]
         for side, marker in (("prior", "^"), ("posterior", "v")):
@@ -67,16 +70,12 @@ def _draw_enlarged_sigma_plot(page: Page, result: AxisComparison) -> None:
         axes.plot(logged_sigma_m, **style.dot_style(EKF2_COLOUR, "s", 3.0, 0.7), mfc="white")
     axes.set_xlim(start_s, end_s)
     axes.set_xlabel(style.TIME_LABEL)
-    if isinstance(ekf2.state, pd.DataFrame):
-        page.write_muted_text("EKF2: ▵ before and ▿ after an update, □ logged σ.")
 
 
 def find_zoom_span(result: AxisComparison) -> Span:
     """Return the start and end (s) of a few updates in the middle of the flight."""
-    candidate_start_times_s = update_times_s = result.kf_run.updates.index.to_numpy()
-    if isinstance(innovations := result.ekf2_tracks.innovations, pd.DataFrame) and len(innovations):
-        candidate_start_times_s = innovations.index.to_numpy()
-    start_s = float(candidate_start_times_s[len(candidate_start_times_s) // 2])
+    update_times_s = result.kf_run.updates.index.to_numpy()
+    start_s = float(update_times_s[len(update_times_s) // 2])
     interval_s = np.median(np.diff(update_times_s)) if len(update_times_s) > 1 else 0.0
     return start_s, start_s + max(float(ZOOM_UPDATE_COUNT * interval_s), MIN_ZOOM_DURATION_S)
 
@@ -84,7 +83,8 @@ def find_zoom_span(result: AxisComparison) -> Span:
 def _describe_sigma_at_updates(result: AxisComparison) -> str:
     sentences = [
         "The line is σ of KF, which grows in each prediction (SIGMA_A "
-        f"{result.kf_run.settings.sigma_a_m_s2:g} m/s²)."
+        f"{result.kf_run.settings.sigma_a_m_s2:g} m/s²).",
+        "EKF2: ▵ before and ▿ after an update, □ logged σ.",
     ]
     for name, filter_summary in get_statistics_by_filter(result).items():
         sigma_before_update_m = filter_summary.sigma_p_before_update_m
@@ -105,18 +105,10 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
     if not secondary_axes:
         return
     page = Page("Appendix: other axes")
-    for panel in (
-        panels.POSITION_PANEL,
-        panels.VELOCITY_PANEL,
-        panels.INNOVATIONS_PANEL,
-        panels.POSITION_SIGMA_PANEL,
-    ):
-        # a single axis fills half of the page
-        columns = make_columns(max(len(secondary_axes), 2))[: len(secondary_axes)]
-        for column, result in zip(columns, secondary_axes, strict=True):
-            if panel is panels.POSITION_PANEL:
-                column.write_heading(result.axis.name)
-            is_last = panel is panels.POSITION_SIGMA_PANEL
-            panel.draw_on_page(column, analysis, result, with_time_label=is_last, is_narrow=True)
-        page.add_columns(*columns)
+    # a single axis fills half of the page
+    columns = make_columns(max(len(secondary_axes), 2))[: len(secondary_axes)]
+    for column, result in zip(columns, secondary_axes, strict=True):
+        column.write_heading(result.axis.name)
+        panels.draw_panels(column, analysis, result, NARROW_PANELS, is_narrow=True)
+    page.add_columns(*columns)
     yield page

@@ -16,7 +16,7 @@ from px4fuse.finding import Finding
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.loop.corrections import CORRECTION_LABELS
-from px4fuse.loop.model import Loop
+from px4fuse.loop.model import Loop, PathResult
 from px4fuse.report.evaluation import (
     describe_method,
     format_error,
@@ -76,12 +76,12 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
 def _write_page(page: Page, loop: Loop) -> None:
     page.write(_describe_closure_error(loop))
     _write_segment(page, loop)
-    missing_reasons = {
-        f"No {correction.what}: {correction.reason}": None
+    missing_reasons = (
+        f"No {correction.what}: {correction.reason}"
         for correction in loop.corrections.values()
         if isinstance(correction, Unavailable)
-    }
-    for reason in missing_reasons:
+    )
+    for reason in dict.fromkeys(missing_reasons):
         page.write_muted_text(reason)
     _write_ate(page, loop)
     axes = page.add_panel("Map in the frame of the odometry", MAP_HEIGHT)
@@ -120,12 +120,14 @@ def draw_map(axes: Axes, loop: Loop) -> None:
 
 
 def _draw_reference(axes: Axes, loop: Loop) -> None:
-    for reference in loop.references[:1]:
-        evaluation = loop.choose_best_path().scores.get(reference.name)
-        if isinstance(evaluation, Evaluation):
-            reference_m = evaluation.transform.apply_inverse(evaluation.reference_position_m)
-            line = TRACK_STYLES["ground truth"] | {"label": reference.name, "zorder": 4}
-            plot_path(axes, reference_m[:, (1, 0)], evaluation.time_s, **line)
+    if not loop.references:
+        return
+    name = loop.references[0].name
+    evaluation = loop.choose_best_path().scores.get(name)
+    if isinstance(evaluation, Evaluation):
+        reference_m = evaluation.transform.apply_inverse(evaluation.reference_position_m)
+        line = TRACK_STYLES["ground truth"] | {"label": name, "zorder": 4}
+        plot_path(axes, reference_m[:, (1, 0)], evaluation.time_s, **line)
 
 
 def make_loop_page(loop: Loop, findings: tuple[Finding, ...]) -> Page:
@@ -180,27 +182,27 @@ def _write_rpe(page: Page, loop: Loop) -> None:
     """Write a table of the RPE of each path, for each reference."""
     for reference in loop.references:
         page.write_heading(f"RPE against {reference.name}, with 95 % intervals")
-        head, rpe_rows, notes = list[str](), list[list[str]](), dict[str, None]()
-        for path in loop.select_reported_paths():
-            score = path.scores[reference.name]
-            if isinstance(score, Unavailable):
-                notes[score.reason] = None
-                continue
-            if not rpe_rows:
-                deltas = (error.delta_text for error in score.rpe)
-                head = ["path", "RMS correction (m)", *deltas, "rotation RMSE (°)"]
-                notes |= dict.fromkeys((describe_method(score), *score.notes, *score.warnings))
-            correction_text = f"{path.correction_rms_m:.2f}"
-            error_texts = [
-                format_error(error).replace(" (95 % ", "\n").replace(" to ", "–").rstrip(")")
-                for error in score.rpe
-            ]
-            rotation_text = format_rmse(score.ate.rotation_deg, 2)
-            rpe_rows.append([path.name, correction_text, *error_texts, rotation_text])
-        if rpe_rows:
-            page.add_table(head, rpe_rows)
-        for note in notes:
+        scores = [(path, path.scores[reference.name]) for path in loop.select_reported_paths()]
+        notes = [score.reason for _, score in scores if isinstance(score, Unavailable)]
+        evaluations = [(path, score) for path, score in scores if isinstance(score, Evaluation)]
+        if evaluations:
+            # all paths have the same deltas, method and notes
+            _, first = evaluations[0]
+            deltas = (error.delta_text for error in first.rpe)
+            head = ["path", "RMS correction (m)", *deltas, "rotation RMSE (°)"]
+            notes += [describe_method(first), *first.notes, *first.warnings]
+            page.add_table(head, [_make_rpe_row(*evaluation) for evaluation in evaluations])
+        for note in dict.fromkeys(notes):
             page.write_muted_text(capitalise_first_letter(note))
+
+
+def _make_rpe_row(path: PathResult, evaluation: Evaluation) -> list[str]:
+    error_texts = [
+        format_error(error).replace(" (95 % ", "\n").replace(" to ", "–").rstrip(")")
+        for error in evaluation.rpe
+    ]
+    rotation_text = format_rmse(evaluation.ate.rotation_deg, 2)
+    return [path.name, f"{path.correction_rms_m:.2f}", *error_texts, rotation_text]
 
 
 def _format_span(loop: Loop) -> str:
@@ -236,30 +238,8 @@ def make_pose_graph_page(graph: Graph) -> Page:
         f"{graph.name}: {graph.dimension}-D, {graph.poses} poses, {graph.edges} edges; initial "
         f"poses: {graph.initialised}",
     )
-    chi2, (min_expected_chi2, max_expected_chi2) = graph.reduced_chi2, graph.reduced_chi2_interval
-    if max_expected_chi2 > 0.0:
-        cause_text = ""
-        if (factor := graph.information_factor) > 1.0:
-            cause_text = (
-                f"Probable cause: all information matrices are about {format_number(factor, 2)} "
-                "times too large. Gate and robust optimisation therefore divide the information "
-                "matrices by this factor."
-            )
-        elif chi2 > max_expected_chi2:
-            cause_text = (
-                "χ² is too large. Possible causes: false closures, or information matrices "
-                "that are too large."
-            )
-        elif chi2 < min_expected_chi2:
-            cause_text = (
-                "The information matrices are too small, so the gate may accept false closures."
-            )
-        page.write_labelled_text(
-            "Fit",
-            f"χ² per degree of freedom {format_number(chi2)} (expected "
-            f"{format_number(min_expected_chi2)} to {format_number(max_expected_chi2)}, 95 %). "
-            f"{cause_text}",
-        )
+    if graph.reduced_chi2_interval[1] > 0.0:  # 0: no degree of freedom, so no statement on the fit
+        page.write_labelled_text("Fit", _describe_graph_fit(graph))
     if isinstance(gates, Unavailable):
         page.write_labelled_text("Gate", f"not applied: {gates.reason}")
     elif not gates:
@@ -292,3 +272,28 @@ def make_pose_graph_page(graph: Graph) -> Page:
             text += f"; {format_count(solution.dropped, 'dropped loop closure')}"
         page.write(text)
     return page
+
+
+def _describe_graph_fit(graph: Graph) -> str:
+    """State χ² per degree of freedom, and the cause if it is outside its 95 % interval."""
+    chi2, (expected_low, expected_high) = graph.reduced_chi2, graph.reduced_chi2_interval
+    cause_text = ""
+    if (factor := graph.information_factor) > 1.0:
+        cause_text = (
+            f"Probable cause: all information matrices are about {format_number(factor, 2)} "
+            "times too large. Gate and robust optimisation therefore divide the information "
+            "matrices by this factor."
+        )
+    elif chi2 > expected_high:
+        cause_text = (
+            "χ² is too large. Possible causes: false closures, or information matrices "
+            "that are too large."
+        )
+    elif chi2 < expected_low:
+        cause_text = (
+            "The information matrices are too small, so the gate may accept false closures."
+        )
+    return (
+        f"χ² per degree of freedom {format_number(chi2)} (expected "
+        f"{format_number(expected_low)} to {format_number(expected_high)}, 95 %). {cause_text}"
+    )

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, structs
 
 from px4fuse.core.text import with_log_name
 from px4fuse.report.style import MUTED_COLOUR, TEXT_COLOUR, Artist, Axes
@@ -169,6 +170,8 @@ def to_typst_data(block: Any, log_name: str) -> Any:
     """Convert page blocks to data for Typst, with figures as SVG."""
     if isinstance(block, str):
         return replace_unprintable(with_log_name(block, log_name))
+    if isinstance(block, Struct):
+        block = structs.asdict(block)
     if isinstance(block, Mapping):
         fields = {
             name: to_typst_data(value, log_name)

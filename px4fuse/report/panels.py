@@ -86,32 +86,27 @@ def add_time_panel(
     title: str,
     height: float,
     *,
-    axis: str | None = None,
+    axis: str = "",
     with_time_label: bool = True,
     **options: Any,
 ) -> Axes:
     """Add a plot over time with gaps, resets, rejections and outliers."""
-    from matplotlib.collections import PolyCollection  # noqa: PLC0415
-
     axes = page.add_panel(title, height, **options)
     segment, x_transform = analysis.segment.whole_flight, axes.get_xaxis_transform()
     axes.set_xlim(segment.start_s, segment.end_s)
     if with_time_label:
         axes.set_xlabel(style.TIME_LABEL)
-    axis_name = analysis.main.axis.name if axis is None else axis
+    axis_name = axis or analysis.main.axis.name
     rejection_times_s = analysis.events.rejection_times_s.get(axis_name, ())
     for order, (_, times_or_spans_s, event_style, marker_height) in enumerate(
         _make_event_markers(analysis, rejection_times_s), start=1
     ):
         if marker_height is None:
-            corners = [
-                [(start_s, 0.0), (start_s, 1.0), (end_s, 1.0), (end_s, 0.0)]
-                for start_s, end_s in times_or_spans_s
+            starts_and_durations_s = [
+                (start_s, end_s - start_s) for start_s, end_s in times_or_spans_s
             ]
-            bands = PolyCollection(
-                corners, transform=x_transform, zorder=0.1 * order, **event_style
-            )
-            axes.add_collection(bands, autolim=False)
+            band_style = event_style | {"transform": x_transform, "zorder": 0.1 * order}
+            axes.broken_barh(starts_and_durations_s, (0.0, 1.0), **band_style)
         else:
             heights = pd.Series(marker_height, np.asarray(times_or_spans_s, np.float64))
             marker_style = event_style | {"zorder": 2.6, "clip_on": marker_height > 0.0}
@@ -164,30 +159,30 @@ class Panel(NamedTuple):
     make_statistics_text: Callable[[AxisComparison], str]
     make_caption: Callable[[AxisComparison], str] = lambda _: ""
 
-    def draw_on_page(
-        self,
-        page: Page,
-        analysis: Analysis,
-        result: AxisComparison,
-        *,
-        with_time_label: bool,
-        is_narrow: bool = False,
-    ) -> None:
-        """Draw the plot on a page; a narrow plot has no caption."""
-        texts = [self.make_statistics_text(result)]
+
+def draw_panels(
+    page: Page,
+    analysis: Analysis,
+    result: AxisComparison,
+    panels: Sequence[Panel],
+    *,
+    is_narrow: bool = False,
+) -> None:
+    """Draw plots below each other, with one common time axis; narrow plots have no captions."""
+    for panel in panels:
+        texts = [panel.make_statistics_text(result)]
         if not is_narrow:
-            texts.append(self.make_caption(result))
+            texts.append(panel.make_caption(result))
         axes = add_time_panel(
             page,
             analysis,
-            self.title,
-            NARROW_PLOT_HEIGHT if is_narrow else self.height,
+            panel.title,
+            NARROW_PLOT_HEIGHT if is_narrow else panel.height,
+            axis=result.axis.name,
+            with_time_label=panel is panels[-1],
             caption=". ".join(filter(None, texts)),
-            # "" omits the markers of rejections: the innovation plot shows hollow dots instead
-            axis="" if self is INNOVATIONS_PANEL else result.axis.name,
-            with_time_label=with_time_label,
         )
-        self.draw(axes, result.with_whole_flight_tracks())
+        panel.draw(axes, result.with_whole_flight_tracks())
 
 
 def add_legend(page: Page, analysis: Analysis) -> PageBlock:
@@ -197,14 +192,13 @@ def add_legend(page: Page, analysis: Analysis) -> PageBlock:
     all_rejection_times_s = [
         time for times in analysis.events.rejection_times_s.values() for time in times
     ]
-    kf_line, *other_lines = (
-        Line2D([], [], **TRACK_STYLES[name], label=name) for name in _collect_states(analysis.main)
-    )
     entries: list[Artist] = [
         Line2D([], [], **style.MEASUREMENT_STYLE | {"ms": 5.0}, label="position"),
-        kf_line,
         Patch(facecolor=style.KF_BAND_COLOUR, lw=0, label="±2σ reported"),
-        *other_lines,
+        *(
+            Line2D([], [], **TRACK_STYLES[name], label=name)
+            for name in _collect_states(analysis.main)
+        ),
         *(
             Patch(**event_style, label=label)
             if height is None
@@ -241,17 +235,15 @@ def draw_tracks(axes: Axes, result: AxisComparison, quantity: QuantityColumns) -
     if quantity is POSITION_QUANTITY:
         measurements = pd.Series(result.axis.measurement_m, result.axis.measurement_time_s)
         draw_curve(axes, measurements, **style.MEASUREMENT_STYLE)
-    kf_steps, drawn_series = result.kf_run.steps, []
+    kf_steps = result.kf_run.steps
     draw_sigma_band(axes, kf_steps[quantity.column], np.sqrt(kf_steps[quantity.variance_column]))
     states = _collect_states(result)
-    states["KF"] = states.pop("KF")  # drawn last
     for name, state in states.items():
-        values = state[quantity.column]
-        if values.notna().any():
-            draw_curve(axes, values, **TRACK_STYLES[name], zorder=2.0 if name == "KF" else 2.5)
-            drawn_series.append(values)
+        # KF below the other tracks
+        zorder = 2.0 if name == "KF" else 2.5
+        draw_curve(axes, state[quantity.column], **TRACK_STYLES[name], zorder=zorder)
     # The ±2σ band is very wide at the start, so it does not set the axis limits
-    all_values = pd.concat(drawn_series)
+    all_values = pd.concat([state[quantity.column] for state in states.values()])
     margin = 0.08 * (all_values.max() - all_values.min()) + 1e-3
     axes.set_ylim(all_values.min() - margin, all_values.max() + margin)
 
@@ -337,12 +329,7 @@ def _describe_innovations(result: AxisComparison) -> str:
             f"{consistency.innovation_mean_m:+.3f} m, standard deviation "
             f"{consistency.innovation_std_m:.3f} m, median √S {consistency.sqrt_s_median_m:.3f} m."
         )
-    plot_limit_m, tables = _find_innovation_limit_m(result), _collect_innovation_tables(result)
-    if any(table["innovation_m"].abs().max() > plot_limit_m for table in tables.values()):
-        sentences.append("Triangles: values outside the plot.")
-    for label, table in tables.items():
-        if "rejected" in table and (rejected_count := int((table["rejected"] > 0).sum())):
-            sentences.append(f"{label} rejected {rejected_count} positions (hollow dots).")
+    sentences.append("Triangles: values outside the plot. Hollow dots: rejected positions.")
     return " ".join(sentences)
 
 

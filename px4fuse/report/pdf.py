@@ -73,12 +73,9 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
     blocks = list[Any]()
     with apply_report_style():
         # Converting each page immediately saves memory
-        for page in (
-            page
-            for draw in PAGE_FUNCTIONS_BY_RESULTS_TYPE[type(results)]
-            for page in draw(content, results)
-        ):
-            blocks += to_typst_data(page.blocks, source.name)
+        for draw in PAGE_FUNCTIONS_BY_RESULTS_TYPE[type(results)]:
+            for page in draw(content, results):
+                blocks += to_typst_data(page.blocks, source.name)
     producer = f"px4fuse {metadata.version('px4fuse')}"
     student = getattr(results, "student", NO_STUDENT)
     student_text = ", ".join(filter(None, (student.name, student.id)))

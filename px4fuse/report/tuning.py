@@ -125,6 +125,7 @@ def _make_vision_noise_advice(comparison: PreparedComparison, estimate: NoiseEst
     reported_sigma_m = 0.0 if np.isnan(variance_m2) else float(np.sqrt(variance_m2))
     changes = make_noise_change(EV_POS, parameters, reported_sigma_m, estimate.value)
     noise_parameter_m = parameters.get(name, np.nan)
+    # EKF2 used a too large σ of the messages: it must use its noise parameter instead
     if EV_POS.noise_mode_parameter in changes and reported_sigma_m > high_m:
         return (
             f"Set {format_changes(changes)}. The source reported a σ of {reported_sigma_m:.2g} m."

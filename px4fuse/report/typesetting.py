@@ -1,8 +1,7 @@
 """Typesetting of reports as PDF with Typst."""
 
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -11,7 +10,6 @@ import typst
 
 from px4fuse.report import fonts
 from px4fuse.report.card_text import PLACE_TEXTS
-from px4fuse.report.page import Page, to_typst_data
 from px4fuse.report.style import FILTER_COLOURS
 
 # PDF/A-3a for archives, PDF/UA-1 for screen readers
@@ -19,32 +17,13 @@ PDF_STANDARDS: list[Any] = ["a-3a", "ua-1"]
 TEMPLATES = ("cover.typ", "report.typ")
 
 
-def compile_pdf(report: Mapping[str, Any]) -> bytes:
-    """Typeset data as PDF with Typst."""
-    with _open_compiler(report) as compiler:
-        document = compiler.compile(format="pdf", pdf_standards=PDF_STANDARDS)
-    assert isinstance(document, bytes)
-    return document
-
-
-def measure_free_height(cover: Page) -> float:
-    """Return the free height (points) on the first page of a report.
-
-    The template cover.typ measures it, and labels the value with <free>.
-    """
-    report = dict.fromkeys(("title", "author", "head", "student"), "")
-    blocks = to_typst_data(cover.blocks, "")
-    with _open_compiler({**report, "blocks": blocks, "results": None}) as compiler:
-        return float(json.loads(compiler.query("<free>", field="value", one=True)))
-
-
 def read_template() -> str:
     folder = Path(__file__).parent
     return "\n".join((folder / name).read_text(encoding="utf-8") for name in TEMPLATES)
 
 
-@contextmanager
-def _open_compiler(report: Mapping[str, Any]) -> Iterator[typst.Compiler]:
+def compile_pdf(report: Mapping[str, Any]) -> bytes:
+    """Typeset data as PDF with Typst, without access to files and packages."""
     font_names = fonts.find_font_names(json.dumps(report, ensure_ascii=False))
     data = {
         **report,
@@ -53,7 +32,7 @@ def _open_compiler(report: Mapping[str, Any]) -> Iterator[typst.Compiler]:
         "place_texts": PLACE_TEXTS,
     }
     with TemporaryDirectory() as empty_folder:
-        yield typst.Compiler(
+        compiler = typst.Compiler(
             input=read_template().encode(),
             root=empty_folder,
             font_paths=typst.Fonts(
@@ -65,3 +44,6 @@ def _open_compiler(report: Mapping[str, Any]) -> Iterator[typst.Compiler]:
             package_cache_path=empty_folder,
             sys_inputs={"data": json.dumps(data)},
         )
+        document = compiler.compile(format="pdf", pdf_standards=PDF_STANDARDS)
+    assert isinstance(document, bytes)
+    return document
