@@ -72,7 +72,10 @@ AIDS_TERMS_NOTE = (
     "√S: standard deviation of an innovation as EKF2 reports it. Source: a sensor that aids EKF2."
 )
 ALL_FINDINGS_TITLE = "All findings"
-MAP_HEIGHT, PLOT_HEIGHT = 190.0, 50.0  # points, of the map and of each plot beside the map
+# Heights (points) of the map and of each plot: beside the map, and below a map of full page width
+HEIGHTS_IN_COLUMNS, HEIGHTS_AT_FULL_WIDTH = (190.0, 50.0), (84.0, 64.0)
+# Tracks with a larger ratio of length to width have a map of full page width
+MIN_LENGTH_TO_WIDTH_RATIO_OF_WIDE_MAP = 2.2
 MAX_DRAWN_SIGMAS = 4.0  # larger innovations ÷ √S are triangles at the edge
 MAP_MARGIN_FACTOR = 1.08  # extent of the map divided by the extent of the tracks
 # Maximum margin of the map, as fraction of the extent of the positions
@@ -168,16 +171,22 @@ def _make_cause_fields(cause: DiagnosedCause) -> dict[str, Any]:
 
 def write_panels(page: Page, analysis: Analysis, card: DiagnosisCard) -> None:
     """Draw map, position errors and innovations, together on the first or on the second page."""
-    section, (left_column, right_column) = Page(), make_columns()
+    section = Page()
     add_legend(section, analysis)
-    _draw_map(left_column, analysis)
-    _draw_error_plots(right_column, analysis, card)
-    _draw_innovations(right_column, analysis)
-    section.add_columns(left_column, right_column)
+    tracks, axis_names = _rotate_map_tracks(analysis)
+    length_m, width_m = np.ptp(tracks["positions"], axis=1)
+    is_wide = length_m > MIN_LENGTH_TO_WIDTH_RATIO_OF_WIDE_MAP * width_m
+    left, right = (section, section) if is_wide else make_columns()
+    map_height, plot_height = HEIGHTS_AT_FULL_WIDTH if is_wide else HEIGHTS_IN_COLUMNS
+    _draw_map(left, analysis, tracks, axis_names, map_height)
+    _draw_error_plots(right, analysis, card, plot_height)
+    _draw_innovations(right, analysis, plot_height)
+    if not is_wide:
+        section.add_columns(left, right)
     page.add_columns(section)
 
 
-def _draw_error_plots(page: Page, analysis: Analysis, card: DiagnosisCard) -> None:
+def _draw_error_plots(page: Page, analysis: Analysis, card: DiagnosisCard, height: float) -> None:
     """Draw the position errors of KF and EKF2, or their difference."""
     result, effect = analysis.main.with_whole_flight_tracks(), card.effect
     plots: list[tuple[str, float | None, pd.Series[float], SigmaByFilter]] = []
@@ -203,7 +212,7 @@ def _draw_error_plots(page: Page, analysis: Analysis, card: DiagnosisCard) -> No
         default=0.0,
     )
     for plot in plots:
-        _draw_error_plot(page, analysis, *plot, half_range_m)
+        _draw_error_plot(page, analysis, height, *plot, half_range_m)
 
 
 def _compute_error_axis_limit_m(error_m: pd.Series[float], sigmas_m: SigmaByFilter) -> float:
@@ -216,6 +225,7 @@ def _compute_error_axis_limit_m(error_m: pd.Series[float], sigmas_m: SigmaByFilt
 def _draw_error_plot(
     page: Page,
     analysis: Analysis,
+    height: float,
     title: str,
     rms_m: float | None,
     error_m: pd.Series[float],
@@ -236,7 +246,7 @@ def _draw_error_plot(
         else TRACK_STYLES[next(iter(sigmas_m))]
     )
 
-    axes = add_time_panel(page, analysis, title, PLOT_HEIGHT, with_time_label=False)
+    axes = add_time_panel(page, analysis, title, height, with_time_label=False)
     axes.set_ylim(-half_range_m, half_range_m)
     for name, sigma in known_sigmas_m.items():
         style.draw_sigma_band(axes, 0.0 * sigma, sigma, style.SIGMA_BAND_COLOURS[name])
@@ -244,11 +254,11 @@ def _draw_error_plot(
     draw_curve(axes, error_m, **line)
 
 
-def _draw_innovations(page: Page, analysis: Analysis) -> None:
+def _draw_innovations(page: Page, analysis: Analysis, height: float) -> None:
     innovations = normalised_innovations(analysis.main)
     legend = ", ".join(f"{style.INNOVATION_SYMBOLS[name]} {name}" for name in innovations)
     title = f"Innovations ÷ √S ({legend}): 95 % expected within ±2; ▲▼ beyond ±{MAX_DRAWN_SIGMAS:g}"
-    axes = add_time_panel(page, analysis, title, PLOT_HEIGHT)
+    axes = add_time_panel(page, analysis, title, height)
     axes.set(ylim=(-1.12 * MAX_DRAWN_SIGMAS, 1.12 * MAX_DRAWN_SIGMAS), yticks=(-2.0, 2.0))
     axes.axhspan(-2.0, 2.0, color=style.CONSISTENT_BAND_COLOUR, lw=0, zorder=0.05)
     style.draw_zero_line(axes)
@@ -297,10 +307,15 @@ def _select_map_tracks(analysis: Analysis) -> dict[str, Array]:
     return {name: track for name, track in tracks.items() if track.size}
 
 
-def _draw_map(page: Page, analysis: Analysis) -> None:
-    tracks, axis_names = _rotate_map_tracks(analysis)
+def _draw_map(
+    page: Page,
+    analysis: Analysis,
+    tracks: Mapping[str, Array],
+    axis_names: tuple[str, str],
+    height: float,
+) -> None:
     axes_width = page.width - AXES_LEFT_MARGIN - AXES_RIGHT_MARGIN
-    limits = _compute_map_limits(tracks, axes_width / MAP_HEIGHT)
+    limits = _compute_map_limits(tracks, axes_width / height)
     distance_m, name = max(
         (np.nanmax(np.abs(track.T - np.clip(track.T, *limits))), name)
         for name, track in tracks.items()
@@ -308,7 +323,7 @@ def _draw_map(page: Page, analysis: Analysis) -> None:
     title = "Map"
     if distance_m > 0.0:
         title += f"; {name} up to {format_metres(distance_m)} m outside the plotted area"
-    axes = page.add_panel(title, MAP_HEIGHT)
+    axes = page.add_panel(title, height)
     style.set_map_axes(axes, *axis_names)
     (left, bottom), (right, top) = limits
     axes.set(xlim=(left, right), ylim=(bottom, top))
