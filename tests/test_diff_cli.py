@@ -9,11 +9,13 @@ import jsonschema
 import pytest
 from cli_tools import contents, error_line, run_checked
 from conftest import LOG, blank_page
+from exchange import replace
 from pypdf import PdfWriter
 from results_tools import LOOP
 from ulog_tools import gnss_log
 
 import px4fuse
+from px4fuse.batch.terminal import format_differences
 from px4fuse.report import pdf
 from px4fuse.results.contract import schema
 
@@ -116,3 +118,11 @@ def test_diff_of_same_file_or_without_results_is_rejected(settings, tmp_path):
         (text, usual, "notes.txt"),
     ):
         assert said in error_line("diff", a, b, "--json", "-")
+
+
+def test_diff_without_axis_of_largest_motion_prints_first_axis(settings):
+    found = px4fuse.diff(*settings)
+    numbers = [replace(one, path=one.path.replace("aisle", "north")) for one in found.numbers]
+    numbers.append(replace(numbers[0], path="log.duration_s", label="Duration"))
+    blocks = format_differences(replace(found, numbers=tuple(numbers))).blocks
+    assert any("Mean NIS of KF, axis of largest motion, A → B" in str(block) for block in blocks)

@@ -370,6 +370,8 @@ BERLIN = "2026-11-20T23:59:59+01:00"
         ("2026-11-20T22:59Z", BERLIN),
         ("2026-07-20 23:59 Europe/Berlin", "2026-07-20T23:59:59+02:00"),  # summer time
         ("2026-11-20 Europe/Berlin", BERLIN),
+        ("20261120T2359+0100", BERLIN),
+        ("2026-11-20 1200 Europe/Berlin", "2026-11-20T12:00:59+01:00"),
     ],
 )
 def test_due_time_with_time_zone_is_parsed(text, is_) -> None:

@@ -254,14 +254,17 @@ def test_report_omits_time_offset_page_if_not_significant() -> None:
          {"Result": "too small for a correction: the limit is 0.036 s",
           "Offset": "The estimated time offset is"}),
         ({"offset_s": -0.25, "interval_s": (-0.28, -0.22)}, 0.0,
-         {"PX4": "250 ms (now 0 ms), or correct the sender's clock. In both cases, "
-          "also set EKF2_DELAY_MAX to 300 ms."}),
+         {"PX4": "250 ms (now 0 ms), or correct the sender's clock. Also set "
+          "EKF2_DELAY_MAX to 300 ms."}),
+        ({"offset_s": -0.31, "interval_s": (-0.34, -0.28)}, 0.0,
+         {"PX4": "cannot exceed 300 ms. Correct the sender's clock. Also set EKF2_DELAY_MAX to "
+          "350 ms."}),
         ({"change_p_value": 0.001}, 0.0, {"Changes": "+0.00 s from 10 s"}),
         ({"drift_ppm": 1000.0}, 0.0, {"Drift": "+1000 ± 588 ppm (95 %)."}),
         ({"drift_ppm": 100.0}, 0.0, {"Drift": "not significant"}),
     ],
-    ids=["fits", "other delay", "late", "early", "negligible", "delay max", "changes", "drift",
-         "no drift"],
+    ids=["fits", "other delay", "late", "early", "negligible", "delay max", "limit", "changes",
+         "drift", "no drift"],
 )  # fmt: skip
 def test_report_on_time_offset_reports_estimate_and_action(
     changes: dict[str, Any], delay_ms: float, expected: dict[str, str]

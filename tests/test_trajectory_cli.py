@@ -162,6 +162,8 @@ def test_evaluate_command_writes_report_and_results(desk, tmp_path, monkeypatch)
     deltas = results(*command, "--rpe", "5m", "--rpe", "10s", "--rpe", "1f")["rpe"]
     units = [(5.0, "m"), (10.0, "s"), (1.0, "frames")]
     assert [(one["delta"], one["unit"]) for one in deltas] == units
+    output = run(*command, "--rpe", "900m", "--json", tmp_path / "far.json").output
+    assert "RPE over 900 m: the reference has no pair of poses" in output
 
 
 @pytest.mark.usefixtures("no_drawing")

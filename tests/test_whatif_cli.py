@@ -10,13 +10,14 @@ import jsonschema
 import numpy as np
 import pytest
 from cli_tools import run_checked
+from exchange import replace
 
 from px4fuse.analysis import WhatIfAnalysis
 from px4fuse.diagnose import run_what_if
 from px4fuse.ekf2.model import prepare_ekf2_model
 from px4fuse.ekf2.whatif import Ekf2Statistics, what_if
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.flight.model import Flight
+from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.report.whatif import (
     NOT_PREDICTABLE_TEXT,
     describe_sweep,
@@ -198,3 +199,19 @@ def test_what_if_table_omits_numbers_if_not_predictable(sample_flight: Flight) -
     assert "'not predictable': the replay rejects more than 35% of the samples" in said
     assert "2 mm of added position noise changes the results strongly" in said
     assert "closest to 1" not in said
+
+
+def test_whatif_line_states_unit_or_band_twice_if_they_differ(swept: WhatIfAnalysis) -> None:
+    changed, *others = swept.statistics.whatif
+    north = replace(
+        changed.axes["north"],
+        nis_band=(0.5, 1.5),
+        position_rmse_to_truth_m=Unavailable("", "", ""),
+    )
+    changed = replace(changed, north=north)
+    statistics = replace(swept.statistics, whatif=(changed, *others))
+    lines = "\n".join(list_statistics(replace(swept, statistics=statistics)))
+    assert "north: mean NIS 0.819 (expected 0.89 to 1.12) → " in lines
+    assert "(expected 0.50 to 1.50)" in lines
+    assert "north: position RMSE 0.068 m → n/a\n" in lines
+    assert "east: median reported position σ 0.059 → " in lines

@@ -89,13 +89,11 @@ def format_differences(results: DiffResults) -> Page:
     for setting in results.settings:
         a_text, b_text = map(_format_setting, (setting.a, setting.b))
         page.write(f"Setting {setting.name}, A → B: {a_text} → {b_text}")
-    # the axis of largest motion is sufficient for a summary
-    main_numbers = [
-        number
-        for number in results.numbers
-        if not number.path.startswith("axes.") or f".{AISLE_AXIS}." in number.path
-    ]
-    for number in main_numbers or results.numbers:
+    # the axis of largest motion, if compared, is sufficient for a summary
+    main_numbers = [number for number in results.numbers if f".{AISLE_AXIS}." in number.path]
+    for number in results.numbers:
+        if main_numbers and number not in main_numbers and number.path.startswith("axes."):
+            continue
         a_text = _format_value(number.a, number.a_interval, number.unit)
         b_text = _format_value(number.b, number.b_interval, number.unit)
         label = capitalise_first_letter(number.label.replace(AISLE_AXIS, "axis of largest motion"))

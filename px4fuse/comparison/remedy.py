@@ -251,7 +251,7 @@ def make_delay_max_change(
 ) -> dict[str, float]:
     """Return a larger EKF2_DELAY_MAX if positions of this age (ms) are otherwise too old.
 
-    PX4 has this parameter since v1.14.
+    PX4 has this parameter since v1.15.
     """
     required_ms = position_age_ms + TRANSMISSION_DELAY_MS
     if required_ms <= settings.get("EKF2_DELAY_MAX", math.inf):

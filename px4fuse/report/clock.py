@@ -140,17 +140,17 @@ def _format_delay_advice(
     fitted_delay_ms = estimate_delay_if_not_as_logged_ms(comparison, time_offset, logged_delay_ms)
     if fitted_delay_ms is None:
         return f"{delay_parameter} {logged_delay_ms:g} ms agrees with the estimated time offset."
-    if limit_text := describe_delay_limit(delay_parameter, fitted_delay_ms, logged_delay_ms):
-        return (
-            f"The maximum-likelihood {delay_parameter} is {fitted_delay_ms:.0f} ms, but "
-            f"{delay_parameter} cannot {limit_text}. Correct the sender's clock."
-        )
     text = (
         f"Set {delay_parameter} to {max(fitted_delay_ms, 0.0):.0f} ms (now {logged_delay_ms:g} "
         "ms), or correct the sender's clock."
     )
+    if limit_text := describe_delay_limit(delay_parameter, fitted_delay_ms, logged_delay_ms):
+        text = (
+            f"The maximum-likelihood {delay_parameter} is {fitted_delay_ms:.0f} ms, but "
+            f"{delay_parameter} cannot {limit_text}. Correct the sender's clock."
+        )
     if delay_max_change := find_delay_max_change(comparison, fitted_delay_ms):
-        text += f" In both cases, also set {format_changes(delay_max_change)}."
+        text += f" Also set {format_changes(delay_max_change)}."
     return text
 
 

@@ -151,10 +151,13 @@ def _write_evaluation(page: Page, evaluation: Evaluation) -> None:
 
 def make_evaluation_page(evaluation: Evaluation) -> Page:
     """Make the terminal output of ``px4fuse evaluate``."""
-    page, tracks = Page(), (evaluation.estimate_track, evaluation.reference_track)
-    page.write(f"Errors of {' against '.join(track.name for track in tracks)}:")
-    for label, error_text, *_ in _make_error_rows(evaluation):
-        page.write(f"{label}: {error_text}")
+    page = Page()
+    page.write(
+        f"Errors of {evaluation.estimate_track.name} against {evaluation.reference_track.name}:"
+    )
+    page.write(f"ATE: {format_error(evaluation.ate)}")
+    for error in evaluation.rpe:
+        page.write(f"RPE over {error.delta_text}: {format_error(error)}")
     _write_warnings(page, evaluation)
     page.write_muted_text(
         f"ATE: position RMSE after alignment ({evaluation.alignment}). RPE: RMSE of the change of "
@@ -173,7 +176,7 @@ def _make_error_rows(evaluation: Evaluation) -> list[list[str]]:
     error_by_name |= {f"RPE over {error.delta_text}": error for error in evaluation.rpe}
     rows = []
     for name, error in error_by_name.items():
-        translation_errors_m, cells = error.translation_m, [""] * 5
+        translation_errors_m, cells = error.translation_m, ["–", *[""] * 5]
         if isinstance(translation_errors_m, Statistics):
             numbers = (
                 translation_errors_m.mean,
@@ -181,16 +184,17 @@ def _make_error_rows(evaluation: Evaluation) -> list[list[str]]:
                 translation_errors_m.std,
                 translation_errors_m.max,
             )
-            cells = [*(f"{number:.3f}" for number in numbers), f"{translation_errors_m.count}"]
-        rows.append([name, format_error(error), *cells, format_rmse(error.rotation_deg, 2)])
+            number_texts = (f"{number:.3f}" for number in numbers)
+            cells = [format_error(error), *number_texts, f"{translation_errors_m.count}"]
+        rows.append([name, *cells, format_rmse(error.rotation_deg, 2)])
     return rows
 
 
 def format_error(error: AbsoluteTrajectoryError | RelativePoseError) -> str:
-    """Format the RMSE of positions with its 95 % interval."""
+    """Format the RMSE of positions with its 95 % interval, or the reason why it is missing."""
     translation_errors_m, interval = error.translation_m, error.interval_m
     if isinstance(translation_errors_m, Unavailable):
-        return "–"
+        return translation_errors_m.reason
     interval_text = ""
     if isinstance(interval, RmseInterval):
         interval_text = f" (95 % {interval.low:.3f} to {interval.high:.3f})"

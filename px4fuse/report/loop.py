@@ -79,7 +79,7 @@ def _write_page(page: Page, loop: Loop) -> None:
     missing_reasons = (
         f"No {correction.what}: {correction.reason}"
         for correction in loop.corrections.values()
-        if isinstance(correction, Unavailable)
+        if isinstance(correction, Unavailable) and correction != loop.true_end
     )
     for reason in dict.fromkeys(missing_reasons):
         page.write_muted_text(reason)
@@ -89,8 +89,9 @@ def _write_page(page: Page, loop: Loop) -> None:
     page.add_legend(axes.get_legend_handles_labels()[0])
     page.write_heading("Loop closures and RPE")
     page.write_muted_text(
-        "p: probability that a true closure has a larger error, given drift and closure noise; "
-        f"the χ² test rejects p below {GATE_ALPHA:g}. Weight of GNC (graduated non-convexity): 1 "
+        "d²: squared Mahalanobis distance of the error, given drift and closure noise. p: "
+        "probability that a true closure has a larger d²; the χ² test rejects p below "
+        f"{GATE_ALPHA:g}. Weight of GNC (graduated non-convexity): 1 "
         "for a used closure, 0 for an excluded closure."
     )
     _write_closures(page, loop)
@@ -170,8 +171,8 @@ def _write_closures(page: Page, loop: Loop) -> None:
         verb = "accepted" if closure.accepted else "rejected"
         text = (
             f"{capitalise_first_letter(f'{closure}'.removeprefix('the '))}: {verb} by the χ² test "
-            "(error "
-            f"{closure.distance_m:.2f} m, {format_p_value(closure.p)})"
+            f"(error {closure.distance_m:.2f} m, d² {closure.d2:.1f}, "
+            f"{closure.degrees_of_freedom} degrees of freedom, {format_p_value(closure.p)})"
         )
         if closure.weight_gnc is not None:
             text += f"; GNC weight {closure.weight_gnc:.2f}"
@@ -198,7 +199,9 @@ def _write_rpe(page: Page, loop: Loop) -> None:
 
 def _make_rpe_row(path: PathResult, evaluation: Evaluation) -> list[str]:
     error_texts = [
-        format_error(error).replace(" (95 % ", "\n").replace(" to ", "–").rstrip(")")
+        "–"
+        if isinstance(error.translation_m, Unavailable)
+        else format_error(error).replace(" (95 % ", "\n").replace(" to ", "–").rstrip(")")
         for error in evaluation.rpe
     ]
     rotation_text = format_rmse(evaluation.ate.rotation_deg, 2)

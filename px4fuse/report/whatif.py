@@ -36,56 +36,58 @@ def describe_changes(analysis: WhatIfAnalysis) -> str:
 
 def list_statistics(analysis: WhatIfAnalysis) -> Iterator[str]:
     """Yield lines with the statistics of EKF2 as replayed, and with changed parameters."""
-    result = analysis.statistics
-    columns, changes_text = [_format_statistics(result.replayed)], describe_changes(analysis)
+    result, changes_text, changed_columns = analysis.statistics, describe_changes(analysis), []
     for summary in result.whatif[: analysis.sweep_start_index]:
         if summary.is_predictable:
-            columns.append(_format_statistics(summary))
+            changed_columns.append(_format_statistics(summary))
         else:
             yield f"EKF2 (replay), {changes_text}: {NOT_PREDICTABLE_TEXT}"
     spans_text = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in result.evaluated_s)
-    changed_text = f" → {changes_text}" * (len(columns) - 1)
-    yield f"{analysis.flight.log.name}, {spans_text}, EKF2 (replay) as flown{changed_text}:"
-    for label, (_, unit) in columns[0].items():
-        texts = [column.get(label, ("n/a", ""))[0] for column in columns]
-        if texts[0] != "n/a":
-            yield f"EKF2 (replay), {label} {' → '.join(texts)}{unit}"
+    change_text = f" → {changes_text}" * len(changed_columns)
+    yield f"{analysis.flight.log.name}, {spans_text}, EKF2 (replay) as flown{change_text}:"
+    for label, replayed_text in _format_statistics(result.replayed).items():
+        text = replayed_text
+        for column in changed_columns:
+            changed_text = column.get(label, "n/a")
+            # a common unit or expected NIS is printed once; the expected NIS depends on the number
+            # of samples
+            text = text.removesuffix(f" {changed_text.partition(' ')[2]}") + f" → {changed_text}"
+        if replayed_text != "n/a":
+            yield f"EKF2 (replay), {label} {text}"
 
 
-def _format_statistics(summary: Ekf2Statistics) -> dict[str, tuple[str, str]]:
-    """Return value and unit of each statistic, by label."""
-    texts = dict[str, tuple[str, str]]()
+def _format_statistics(summary: Ekf2Statistics) -> dict[str, str]:
+    """Return each statistic with its unit, by label."""
+    texts = dict[str, str]()
     for name, axis in summary.axes.items():
-        rmse_text = _format_number(axis.position_rmse_to_truth_m)
         texts |= {
-            f"{name}: position RMSE": (rmse_text, " m"),
+            f"{name}: position RMSE": _format_number(axis.position_rmse_to_truth_m, " m"),
             f"{name}: mean NIS": _format_nis(axis),
-            f"{name}: median reported position σ": (_format_number(axis.sigma_p_median_m), " m"),
+            f"{name}: median reported position σ": _format_number(axis.sigma_p_median_m, " m"),
         }
-    gap_text = _format_number(summary.longest_without_fusion_s, 2)
     texts |= {
-        "rejected positions": (_format_percent(summary.rejected_fraction), " %"),
-        "longest time without fusion": (gap_text, " s"),
-        "position resets": (f"{summary.resets}", ""),
+        "rejected positions": _format_percent(summary.rejected_fraction),
+        "longest time without fusion": _format_number(summary.longest_without_fusion_s, " s", 2),
+        "position resets": f"{summary.resets}",
     }
     if (rejected_fraction := summary.velocity_rejected_fraction) is not None:
-        texts["rejected GNSS velocities"] = _format_percent(rejected_fraction), " %"
-    texts["mean heading error"] = _format_number(summary.heading_error_mean_deg, 1), "°"
-    texts["height RMSE"] = _format_number(summary.height_rmse_to_truth_m), " m"
+        texts["rejected GNSS velocities"] = _format_percent(rejected_fraction)
+    texts["mean heading error"] = _format_number(summary.heading_error_mean_deg, "°", 1)
+    texts["height RMSE"] = _format_number(summary.height_rmse_to_truth_m, " m")
     for name, aid in {**summary.heights, **summary.others}.items():
         label = AIDS[name].label
         texts[f"{label}: mean NIS"] = _format_nis(aid)
-        texts[f"{label}: rejected"] = _format_percent(aid.rejected_fraction), " %"
+        texts[f"{label}: rejected"] = _format_percent(aid.rejected_fraction)
     return texts
 
 
-def _format_nis(statistics: AxisStatistics | AidStatistics) -> tuple[str, str]:
+def _format_nis(statistics: AxisStatistics | AidStatistics) -> str:
     band_text = " (expected {:.2f} to {:.2f})".format(*statistics.nis_band)
-    return format_number(statistics.nis_mean), band_text
+    return format_number(statistics.nis_mean) + band_text
 
 
 def _format_percent(fraction: float) -> str:
-    return f"{100.0 * fraction:.1f}"
+    return f"{100.0 * fraction:.1f} %"
 
 
 def list_sweep_results(analysis: WhatIfAnalysis) -> Iterator[str]:
@@ -96,9 +98,10 @@ def list_sweep_results(analysis: WhatIfAnalysis) -> Iterator[str]:
         text = NOT_PREDICTABLE_TEXT
         if summary.is_predictable:
             text = (
-                f"horizontal position RMSE {_format_number(summary.position_rmse_to_truth_m)} m, "
+                "horizontal position RMSE "
+                f"{_format_number(summary.position_rmse_to_truth_m, ' m')}, "
                 f"mean NIS {format_number(summary.nis_mean)}, "
-                f"rejected {_format_percent(summary.rejected_fraction)} %"
+                f"rejected {_format_percent(summary.rejected_fraction)}"
             )
         yield f"{value_text.rstrip()}: {text}"
 
@@ -146,8 +149,8 @@ def describe_sweep(analysis: WhatIfAnalysis) -> list[str]:
     return [*sentences, *(f"{note}." for note in analysis.statistics.notes)]
 
 
-def _format_number(value: float | Unavailable, digits: int = 3) -> str:
-    return "n/a" if isinstance(value, Unavailable) else f"{value:.{digits}f}"
+def _format_number(value: float | Unavailable, unit: str, digits: int = 3) -> str:
+    return "n/a" if isinstance(value, Unavailable) else f"{value:.{digits}f}{unit}"
 
 
 def make_whatif_page(analysis: WhatIfAnalysis) -> Page:

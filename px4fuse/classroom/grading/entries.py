@@ -568,7 +568,7 @@ def parse_due_time(
             "followed by a time zone ('+01:00' or 'Europe/Berlin')."
         ) from error
     # a date means the end of the day, and a minute its last second
-    time_of_day_match = re.search(r"\d\d:\d\d(:\d\d)?", text)
+    time_of_day_match = re.search(r"[^-W\d]\d\d(?::?\d\d(:?\d\d)?)?", "T".join(words))
     if time_of_day_match is None:
         due_time = due_time.replace(hour=23, minute=59, second=59)
     elif time_of_day_match[1] is None:
