@@ -225,7 +225,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (the order of EKF2's fusions in one p
         tuple(configurations),
         tuple(arrays.events for arrays in intervals),
         positions.innovation,
-        positions.innovation_variance.astype(np.float32),
+        positions.innovation_variance,
         positions.measurement_variance.astype(np.float32),
         positions.rejected,
         positions.fused,
@@ -369,7 +369,8 @@ class _PositionFusion:
         self.gate_squared = np.maximum(np.repeat(gates, 3, axis=0).T, MIN_INNOVATION_GATE) ** 2
         self.measured_values, self.measurement_variance = _collect_measurements(batch)
         self.decisions = _FusionDecisions(batch, action)
-        self.innovation, self.innovation_variance = np.full((2, *events.shape, 6), np.nan)
+        self.innovation = np.full((*events.shape, 6), np.nan)
+        self.innovation_variance = self.innovation.astype(np.float32)
         self.rejected, self.fused, self.reset = np.zeros((3, *events.shape), bool)
         self.reset_m = np.zeros((*events.shape, 2))
 

@@ -338,7 +338,12 @@ def compute_delayed_tracks(
     """
     runs = _run_model(model, configurations)
     for index in map(runs[0].configurations.index, configurations):
-        yield pd.concat([_make_track(run, compute_delayed_states(run, index)) for run in runs])
+        yield pd.concat([_make_delayed_track(run, index) for run in runs])
+
+
+def _make_delayed_track(run: SegmentRun, configuration_index: int) -> pd.DataFrame:
+    state = compute_delayed_states(run, configuration_index)
+    return _make_track(run, state[:, VELOCITY], state[:, POSITION])
 
 
 def _run_model(
@@ -372,11 +377,12 @@ def run_configurations(
     ]
 
 
-def _make_track(run: SegmentRun, state: Array) -> pd.DataFrame:
+def _make_track(run: SegmentRun, velocity_m_s: Array, position_m: Array) -> pd.DataFrame:
     """Return a table of velocity (m/s) and position (m, in EKF2's published coordinates)."""
-    position_m = state[:, POSITION] / run.segment.internal_to_published_position_ratio
-    track = np.hstack([position_m, state[:, VELOCITY]])
-    return pd.DataFrame(track, time_index(run.segment.time_s), Columns.STATE, copy=False)
+    states = np.hstack(
+        [position_m / run.segment.internal_to_published_position_ratio, velocity_m_s]
+    )
+    return pd.DataFrame(states, time_index(run.segment.time_s), Columns.STATE, copy=False)
 
 
 def _make_replay(
@@ -499,8 +505,7 @@ def _make_state_tracks(
         attitude_correction_rad = sum_attitude_corrections(
             state[:, THETA] - segment.attitude_error_rad, lag_steps, inputs.mean_step_s, horizon_s
         )
-    published_state = np.zeros_like(state)
-    published_state[:, VELOCITY], published_position_m = compute_published_state(
+    published_velocity_m_s, published_position_m = compute_published_state(
         segment,
         state,
         np.cumsum(reset_m, axis=0),
@@ -509,12 +514,13 @@ def _make_state_tracks(
         configuration.settings,
     )
     # EKF2 publishes the position of the vehicle's origin, not of the IMU (output_predictor.cpp)
-    published_state[:, POSITION] = published_position_m - segment.body_to_ned @ inputs.imu_offset_m
+    published_position_m = published_position_m - segment.body_to_ned @ inputs.imu_offset_m
     heading_rad = (
         np.arctan2(segment.body_to_ned[:, 1, 0], segment.body_to_ned[:, 0, 0]) + state[:, HEADING]
     )
-    return _make_track(run, state).assign(heading_rad=heading_rad), _make_track(
-        run, published_state
+    fusion_horizon_track = _make_track(run, state[:, VELOCITY], state[:, POSITION])
+    return fusion_horizon_track.assign(heading_rad=heading_rad), _make_track(
+        run, published_velocity_m_s, published_position_m
     )
 
 
