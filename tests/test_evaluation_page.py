@@ -1,6 +1,5 @@
 """Page of ``px4fuse evaluate``: captions and panels, checked against closed forms and evo."""
 
-import re
 from functools import cache
 from typing import Any
 
@@ -16,7 +15,6 @@ from trajectory_tools import flight, transformed
 from px4fuse.core.text import format_metres
 from px4fuse.loop.tracks import read_trajectory_source
 from px4fuse.report.evaluation import (
-    describe_rpe_growth,
     describe_unaligned_rmse,
     draw_pages,
 )
@@ -101,26 +99,6 @@ def test_unaligned_rmse_in_evaluation_report_equals_evo() -> None:
     assert f"translation {format_metres(np.linalg.norm(centre))} m" in sentence
     half = transformed(true, Rotation.identity(), np.zeros(3), 0.5, kind="slam")
     assert ", scale 2." in describe_unaligned_rmse(evaluate(half, true, alignment="sim3"))
-
-
-@pytest.mark.parametrize(("kind", "times"), [("noise", 1.0), ("walk", 10**0.5), ("scale", 10.0)])
-def test_rpe_growth_distinguishes_noise_from_drift(kind: str, times: float) -> None:
-    rng = np.random.default_rng(3)
-    n = 20_001
-    error = {
-        "noise": rng.normal(0.0, 0.1, (n, 3)),
-        "walk": np.cumsum(rng.normal(0.0, 0.01, (n, 3)), axis=0),
-        "scale": 0.05 * line(n).position_m,
-    }[kind]
-    rpe = evaluate_with_error(error).rpe
-    sentence = describe_rpe_growth(rpe)
-    growth = re.search(
-        r"From 1 to 10 m \(--rpe\), the RPE RMSE grows by a factor of ([\d.]+?)\. ", sentence
-    )
-    assert float(growth[1]) == pytest.approx(times, rel=0.1)
-    assert "1 for independent noise, 3.2 for a random walk, 10 for a scale" in sentence
-    assert describe_rpe_growth((replace(rpe[0], unit="s"), *rpe)) == sentence
-    assert "Add a second distance" in describe_rpe_growth(rpe[:1])
 
 
 # -- panels ----------------------------------------------------------------------------------------

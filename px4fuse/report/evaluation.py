@@ -144,9 +144,7 @@ def _write_evaluation(page: Page, evaluation: Evaluation) -> None:
         for quantity in (ate.interval_m, ate.rotation_deg, *rpe_translations)
         if isinstance(quantity, Unavailable)
     ]
-    growth_text = describe_rpe_growth(evaluation.rpe)
-    notes = dict.fromkeys([*missing_reasons, *evaluation.notes, growth_text])
-    page.write_muted_text(" ".join(notes).rstrip())
+    page.write_muted_text(" ".join(dict.fromkeys([*missing_reasons, *evaluation.notes])))
 
 
 def make_evaluation_page(evaluation: Evaluation) -> Page:
@@ -212,31 +210,6 @@ def describe_unaligned_rmse(evaluation: Evaluation) -> str:
         f"RMSE before alignment {format_metres(rmse_m)} m. Alignment: "
         f"rotation {np.degrees(alignment.to_rotation().magnitude()):.1f}°, translation "
         f"{format_metres(shift_m)} m{scale_text}."
-    )
-
-
-def describe_rpe_growth(rpe: tuple[RelativePoseError, ...]) -> str:
-    """Describe the growth of the relative pose error (RPE) with distance or time."""
-    # Distances, times and numbers of frames cannot be compared: use the most frequent unit
-    units = [error.unit for error in rpe]
-    unit = max(units, key=units.count, default="")
-    rmse_by_delta = {
-        error.delta: translation_errors_m.rmse
-        for error in rpe
-        if isinstance(translation_errors_m := error.translation_m, Statistics)
-        and translation_errors_m.rmse > NEGLIGIBLE_ERROR_M
-        and error.unit == unit
-    }
-    if not rmse_by_delta:
-        return ""
-    if len(rmse_by_delta) == 1:
-        return "Add a second distance with --rpe: drift grows with distance, noise does not."
-    smallest, largest = min(rmse_by_delta), max(rmse_by_delta)
-    return (
-        f"From {smallest:g} to {largest:g} {unit} (--rpe), the RPE RMSE grows "
-        f"by a factor of {rmse_by_delta[largest] / rmse_by_delta[smallest]:.2g}. Expected: 1 for "
-        f"independent noise, {np.sqrt(largest / smallest):.2g} for a random walk, "
-        f"{largest / smallest:.3g} for a scale or heading error."
     )
 
 
