@@ -37,23 +37,23 @@ _MODULE_BY_NAME = {
 __all__ = list(_MODULE_BY_NAME)
 
 if _typing.TYPE_CHECKING:
-    from px4fuse.analysis import Analysis as Analysis
-    from px4fuse.api import close_loop as close_loop
-    from px4fuse.api import compare as compare
-    from px4fuse.api import evaluate as evaluate
-    from px4fuse.api import table as table
-    from px4fuse.api import what_if as what_if
-    from px4fuse.api import write_page as write_page
-    from px4fuse.api import write_report as write_report
-    from px4fuse.batch.changes import diff as diff
-    from px4fuse.batch.run import run_batch as run_batch
-    from px4fuse.core.record import Unavailable as Unavailable
-    from px4fuse.errors import Px4FuseError as Px4FuseError
-    from px4fuse.filter.kalman import run_kf as run_kf
-    from px4fuse.filter.settings import Settings as Settings
-    from px4fuse.findings import find as find
-    from px4fuse.readers import read_log as read_log
-    from px4fuse.readers.trajectory import read_trajectory as read_trajectory
+    from .analysis import Analysis as Analysis
+    from .api import close_loop as close_loop
+    from .api import compare as compare
+    from .api import evaluate as evaluate
+    from .api import table as table
+    from .api import what_if as what_if
+    from .api import write_page as write_page
+    from .api import write_report as write_report
+    from .batch.changes import diff as diff
+    from .batch.run import run_batch as run_batch
+    from .core.record import Unavailable as Unavailable
+    from .errors import Px4FuseError as Px4FuseError
+    from .filter.kalman import run_kf as run_kf
+    from .filter.settings import Settings as Settings
+    from .findings import find as find
+    from .readers import read_log as read_log
+    from .readers.trajectory import read_trajectory as read_trajectory
 else:
 
     def __dir__():

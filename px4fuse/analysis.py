@@ -3,19 +3,19 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from px4fuse.comparison.estimates import Estimates
-from px4fuse.comparison.flight_events import Events
-from px4fuse.comparison.model import AxisComparison, Comparison
-from px4fuse.comparison.rerun_effects import Rerun
-from px4fuse.comparison.reruns import Reruns
-from px4fuse.core.record import display_html, one_line_repr
-from px4fuse.ekf2.aids import AidResult
-from px4fuse.ekf2.replay import Ekf2Replay
-from px4fuse.ekf2.whatif import WhatIf
-from px4fuse.finding import Finding
-from px4fuse.flight.model import Flight, Unavailable
-from px4fuse.loop.model import Loop
-from px4fuse.request import ComparisonRequest
+from .comparison.estimates import Estimates
+from .comparison.flight_events import Events
+from .comparison.model import AxisComparison, Comparison
+from .comparison.rerun_effects import Rerun
+from .comparison.reruns import Reruns
+from .core.record import display_html, one_line_repr
+from .ekf2.aids import AidResult
+from .ekf2.replay import Ekf2Replay
+from .ekf2.whatif import WhatIf
+from .finding import Finding
+from .flight.model import Flight, Unavailable
+from .loop.model import Loop
+from .request import ComparisonRequest
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)

@@ -7,24 +7,24 @@ from typing import Any, Literal, get_args
 import pandas as pd
 from msgspec import structs
 
-from px4fuse import request
-from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import FilterSummary, UntestedFilter
-from px4fuse.core.record import display_html
-from px4fuse.core.writing import write_output_files
-from px4fuse.diagnose import diagnose, require_available, run_what_if
-from px4fuse.ekf2 import whatif
-from px4fuse.ekf2.model import prepare_ekf2_model
-from px4fuse.ekf2.whatif import WhatIf
-from px4fuse.errors import OutputError, SettingsError
-from px4fuse.flight.model import Flight, Unavailable
-from px4fuse.loop.analysis import analyse
-from px4fuse.loop.model import Loop
-from px4fuse.loop.tracks import LoopSource, read_trajectory_source
-from px4fuse.readers import read_log
-from px4fuse.trajectory import evaluation
-from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.trajectory.model import Trajectory
+from . import request
+from .analysis import Analysis
+from .comparison.model import FilterSummary, UntestedFilter
+from .core.record import display_html
+from .core.writing import write_output_files
+from .diagnose import diagnose, require_available, run_what_if
+from .ekf2 import whatif
+from .ekf2.model import prepare_ekf2_model
+from .ekf2.whatif import WhatIf
+from .errors import OutputError, SettingsError
+from .flight.model import Flight, Unavailable
+from .loop.analysis import analyse
+from .loop.model import Loop
+from .loop.tracks import LoopSource, read_trajectory_source
+from .readers import read_log
+from .trajectory import evaluation
+from .trajectory.evaluation import Evaluation
+from .trajectory.model import Trajectory
 
 Pathlike = str | Path
 Progress = Callable[[str], None]
@@ -288,9 +288,9 @@ def write_report(analysis: Analysis, path: Pathlike) -> Path:
     OutputError, SettingsError
         A file cannot be written, or the analysis is not from :func:`px4fuse.compare`.
     """
-    from px4fuse.report.pdf import render_pdf  # noqa: PLC0415 - slow import
-    from px4fuse.results.build import make_comparison_results  # noqa: PLC0415
-    from px4fuse.results.contract import to_json  # noqa: PLC0415
+    from .report.pdf import render_pdf  # noqa: PLC0415 - slow import
+    from .results.build import make_comparison_results  # noqa: PLC0415
+    from .results.contract import to_json  # noqa: PLC0415
 
     report_path = _require_suffix(path, ".pdf")
     serialisable_results = make_comparison_results(_require_request(analysis), analysis)
@@ -310,7 +310,7 @@ def write_page(analysis: Analysis, path: Pathlike) -> Path:
     OutputError, SettingsError
         The page cannot be written, or the analysis is not from :func:`px4fuse.compare`.
     """
-    from px4fuse.explore.page import make_analysis_page  # noqa: PLC0415 - slow import
+    from .explore.page import make_analysis_page  # noqa: PLC0415 - slow import
 
     page_path = _require_suffix(path, ".html")
     _require_request(analysis)
@@ -320,7 +320,7 @@ def write_page(analysis: Analysis, path: Pathlike) -> Path:
 
 @display_html.register
 def _display_card(analysis: Analysis) -> str | None:
-    from px4fuse.report.card_html import make_diagnosis_card, make_notebook_html  # noqa: PLC0415 - slow import
+    from .report.card_html import make_diagnosis_card, make_notebook_html  # noqa: PLC0415 - slow import
 
     return None if analysis.request is None else make_notebook_html(make_diagnosis_card(analysis))
 

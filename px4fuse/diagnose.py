@@ -37,46 +37,46 @@ from typing import TypeVar
 
 from msgspec import structs
 
-from px4fuse.analysis import AidingSourceAnalysis, Analysis, WhatIfAnalysis
-from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.difference_steps import (
+from .analysis import AidingSourceAnalysis, Analysis, WhatIfAnalysis
+from .comparison.comparison import compare
+from .comparison.difference_steps import (
     explain_ekf2_difference,
     find_corrected_noise_settings,
     list_explanation_configurations,
 )
-from px4fuse.comparison.estimates import (
+from .comparison.estimates import (
     Estimates,
     Progress,
     estimate,
     estimate_noises_and_time_offset,
     ignore_progress,
 )
-from px4fuse.comparison.flight_events import collect_events
-from px4fuse.comparison.model import Comparison, PreparedComparison
-from px4fuse.comparison.preparation import (
+from .comparison.flight_events import collect_events
+from .comparison.model import Comparison, PreparedComparison
+from .comparison.preparation import (
     explain_missing_source,
     prepare_comparison_inputs,
     shift_timestamps,
 )
-from px4fuse.comparison.remedy import estimate_ekf2_parameters
-from px4fuse.comparison.reruns import Reruns, list_rerun_configurations, rerun_filters
-from px4fuse.core.memory import release_free_memory
-from px4fuse.core.reading import display_name
-from px4fuse.ekf2.aids import evaluate_aids
-from px4fuse.ekf2.model import Ekf2Model, prepare_ekf2_model
-from px4fuse.ekf2.whatif import make_sweep_values, what_if
-from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.filter.signals import AISLE_AXIS
-from px4fuse.filter.time_offset import SourceTimeOffset
-from px4fuse.filter.tuning import HORIZONTAL
-from px4fuse.findings import find, find_aid_findings
-from px4fuse.findings.model import WRONG_CONVENTION_KEY
-from px4fuse.findings.source_convention import detect_wrong_orientation
-from px4fuse.flight.ekf2_parameters import check_parameters
-from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, PositionTrack, Unavailable
-from px4fuse.loop.model import Loop
-from px4fuse.readers import read_log
-from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
+from .comparison.remedy import estimate_ekf2_parameters
+from .comparison.reruns import Reruns, list_rerun_configurations, rerun_filters
+from .core.memory import release_free_memory
+from .core.reading import display_name
+from .ekf2.aids import evaluate_aids
+from .ekf2.model import Ekf2Model, prepare_ekf2_model
+from .ekf2.whatif import make_sweep_values, what_if
+from .errors import MissingDataError, SettingsError
+from .filter.signals import AISLE_AXIS
+from .filter.time_offset import SourceTimeOffset
+from .filter.tuning import HORIZONTAL
+from .findings import find, find_aid_findings
+from .findings.model import WRONG_CONVENTION_KEY
+from .findings.source_convention import detect_wrong_orientation
+from .flight.ekf2_parameters import check_parameters
+from .flight.model import DIAGNOSIS_WITHHELD, Flight, PositionTrack, Unavailable
+from .loop.model import Loop
+from .readers import read_log
+from .request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
 
 Result = TypeVar("Result")
 
@@ -176,7 +176,7 @@ def diagnose_comparison(comparison: Comparison, progress: Progress = ignore_prog
     reruns = rerun(comparison, estimates, progress)
     release_free_memory()
     progress("measuring the loop closure error")
-    from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 - not for tune and sync
+    from .loop.analysis import analyse_flight_loop  # noqa: PLC0415 - not for tune and sync
 
     flight = comparison.flight
     analysis = Analysis(  # inherits the fields of Comparison, Estimates and Reruns
@@ -228,8 +228,8 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
     if requested_file is None:
         return flight
     # imported on demand: scipy.signal and scipy.ndimage need 0.2 s
-    from px4fuse.alignment.placement import align_position_file  # noqa: PLC0415
-    from px4fuse.readers.position_file import read_position_file  # noqa: PLC0415
+    from .alignment.placement import align_position_file  # noqa: PLC0415
+    from .readers.position_file import read_position_file  # noqa: PLC0415
 
     position_recording = read_position_file(
         requested_file.path,
@@ -399,8 +399,8 @@ def analyse_loop_closure(request: LoopRequest, progress: Progress = ignore_progr
     TrajectoryError, LogError, MissingDataError, SettingsError
         A file cannot be read or lacks required data, or a setting is out of range.
     """
-    from px4fuse.loop.analysis import analyse  # noqa: PLC0415 - not for tune and sync
-    from px4fuse.loop.tracks import find_odometry, read_trajectory_source  # noqa: PLC0415
+    from .loop.analysis import analyse  # noqa: PLC0415 - not for tune and sync
+    from .loop.tracks import find_odometry, read_trajectory_source  # noqa: PLC0415
 
     progress(f"reading {display_name(Path(request.source))}")
     system, reference = request.system, None

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from px4fuse.core.record import Record, Span
+from .core.record import Record, Span
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, Severity, Severity] = ("error", "warning", "note")

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from px4fuse.filter.kalman import KfRun, run_kf
-from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis
-from px4fuse.flight.model import Unavailable
-from px4fuse.loop.closure import distribute_by_distance
-from px4fuse.trajectory.model import cumulative_distance
+from .filter.kalman import KfRun, run_kf
+from .filter.settings import Settings
+from .filter.signals import Axis
+from .flight.model import Unavailable
+from .loop.closure import distribute_by_distance
+from .trajectory.model import cumulative_distance
 
 TRUE_VELOCITY_M_S = 1.0
 PREDICTION_COUNT = 30

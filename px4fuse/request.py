@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, Self
 
 import msgspec
 
-from px4fuse.core.text import UNIT_BY_SUFFIX, replace_unencodable
+from .core.text import UNIT_BY_SUFFIX, replace_unencodable
 
 AUTO: Literal["auto"] = "auto"
 # Default settings of KF: process noise, measurement noise and prediction interval

@@ -6,7 +6,10 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from px4fuse.alignment.time_and_pose_fit import (
+from px4fuse.flight.model import Flight, Unavailable
+from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_BEST_RESIDUAL_RATIO
+
+from .time_and_pose_fit import (
     INTERPOLATION_ERROR_M,
     MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH,
     CorrelationPeak,
@@ -14,7 +17,7 @@ from px4fuse.alignment.time_and_pose_fit import (
     find_correlation_peak,
     fit_by_least_squares,
 )
-from px4fuse.alignment.tracks import (
+from .tracks import (
     EKF2_REFERENCE,
     IMU_REFERENCE,
     MIN_MOTION_M,
@@ -32,8 +35,6 @@ from px4fuse.alignment.tracks import (
     remove_spikes,
     resample_to_grid,
 )
-from px4fuse.flight.model import Flight, Unavailable
-from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_BEST_RESIDUAL_RATIO
 
 # Frames to try if the yaw is estimated, without nwu: it is the same as enu with another yaw
 FRAMES_FOR_ESTIMATED_YAW = ("ned", "enu")

@@ -12,27 +12,6 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.alignment.matching import (
-    MIN_CONCORDANCE_CORRELATION_WITHOUT_WARNING,
-    AlignmentProblem,
-    TrackMatch,
-    find_match,
-    is_reliable_fit,
-    needs_rotation,
-)
-from px4fuse.alignment.time_and_pose_fit import (
-    MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH,
-    compute_clipped_rms_m,
-)
-from px4fuse.alignment.tracks import (
-    EKF2_REFERENCE,
-    IMU_REFERENCE,
-    MIN_MATCHED_SAMPLES,
-    MIN_MOTION_M,
-    NoMatchError,
-    align_samples,
-    make_continuous_ekf2_track,
-)
 from px4fuse.convention.axes import MAX_TIME_OFFSET_S, METRES_PER_UNIT
 from px4fuse.convention.check import determine_source_convention
 from px4fuse.convention.correction import MIN_FRAME_ROTATION_DEG
@@ -53,6 +32,28 @@ from px4fuse.flight.model import (
 from px4fuse.readers.common import select_valid_rows
 from px4fuse.readers.position_file import PositionRecording
 from px4fuse.trajectory.model import NED_COMPONENTS_BY_FRAME
+
+from .matching import (
+    MIN_CONCORDANCE_CORRELATION_WITHOUT_WARNING,
+    AlignmentProblem,
+    TrackMatch,
+    find_match,
+    is_reliable_fit,
+    needs_rotation,
+)
+from .time_and_pose_fit import (
+    MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH,
+    compute_clipped_rms_m,
+)
+from .tracks import (
+    EKF2_REFERENCE,
+    IMU_REFERENCE,
+    MIN_MATCHED_SAMPLES,
+    MIN_MOTION_M,
+    NoMatchError,
+    align_samples,
+    make_continuous_ekf2_track,
+)
 
 # Maximum duration (s) of the data for a comparison with the IMU, to limit the computing time
 MAX_CONVENTION_CHECK_SPAN_S = 7200.0

@@ -6,7 +6,11 @@ import numpy as np
 from scipy.ndimage import label
 from scipy.optimize import least_squares
 
-from px4fuse.alignment.tracks import (
+from px4fuse.core.arrays import Array, ComplexArray, rms
+from px4fuse.trajectory.correlation import autocovariance, compute_moments
+from px4fuse.trajectory.time_offset import GRID_STEP_S
+
+from .tracks import (
     EKF2_REFERENCE,
     IMU_REFERENCE,
     MIN_MATCHED_SAMPLES,
@@ -14,9 +18,6 @@ from px4fuse.alignment.tracks import (
     NoMatchError,
     SampledTrack,
 )
-from px4fuse.core.arrays import Array, ComplexArray, rms
-from px4fuse.trajectory.correlation import autocovariance, compute_moments
-from px4fuse.trajectory.time_offset import GRID_STEP_S
 
 # Maximum change (s) of the lag from the correlation peak to the least-squares fit
 MAX_LAG_CORRECTION_S = 1.0

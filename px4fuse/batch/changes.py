@@ -14,7 +14,6 @@ from typing import Literal
 
 from msgspec.structs import replace
 
-from px4fuse.batch.rows import find_value
 from px4fuse.comparison.model import FILTER_NAMES, FilterSummary
 from px4fuse.comparison.reruns import is_inconsistent
 from px4fuse.core.reading import display_name, hash_files, read_bytes_limited, read_head
@@ -43,6 +42,8 @@ from px4fuse.results.contract import (
 )
 from px4fuse.results.reading import MAX_RESULTS_BYTES, read_results
 from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_attached_results
+
+from .rows import find_value
 
 ProgressCallback = Callable[[str], None]
 Results = ComparisonResults | AidsResults

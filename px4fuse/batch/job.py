@@ -6,8 +6,12 @@ from pathlib import Path
 
 import msgspec
 
-from px4fuse.batch.logs import local_file
-from px4fuse.batch.rows import (
+from px4fuse.core.reading import hash_files, max_log_bytes
+from px4fuse.errors import LogError, MissingDataError, Px4FuseError
+from px4fuse.request import ComparisonRequest, replace_argument_names
+
+from .logs import local_file
+from .rows import (
     STATUS_FAILED,
     STATUS_NOT_COMPARED,
     Row,
@@ -15,9 +19,6 @@ from px4fuse.batch.rows import (
     collect_log_values,
     make_axis_rows,
 )
-from px4fuse.core.reading import hash_files, max_log_bytes
-from px4fuse.errors import LogError, MissingDataError, Px4FuseError
-from px4fuse.request import ComparisonRequest, replace_argument_names
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,6 @@ from typing import Any
 
 import pandas as pd
 
-from px4fuse.batch.rows import (
-    FINDING_SEPARATOR,
-    RESULT_PATH_BY_COLUMN,
-    STATUS_DONE,
-    STATUS_FAILED,
-    STATUS_NOT_COMPARED,
-)
 from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import (
     format_count,
@@ -30,6 +23,14 @@ from px4fuse.html.frame import Cell, Column, Row, RowDetailsSection
 from px4fuse.html.safe import load_template, make_relative_url
 from px4fuse.report.card_html import SIGMA_RATIO_AXIS
 from px4fuse.report.card_text import SEVERITY_SIGNS, SYMBOL_BY_REFERENCE, format_consistent_ratios
+
+from .rows import (
+    FINDING_SEPARATOR,
+    RESULT_PATH_BY_COLUMN,
+    STATUS_DONE,
+    STATUS_FAILED,
+    STATUS_NOT_COMPARED,
+)
 
 # Columns of σ ratios from innovations (source) and from errors against ground truth (truth)
 SIGMA_RATIO_LABELS = {

@@ -14,12 +14,20 @@ from typing import Annotated, Any
 import msgspec
 import pandas as pd
 
-from px4fuse.batch import LOG_ANALYSIS_TIMEOUT_S
-from px4fuse.batch.engine import connect_to_cluster, run_jobs
-from px4fuse.batch.job import Job, LogOutcome, analyse, make_failure_row, make_file_stem
-from px4fuse.batch.logs import LogAddress, find_logs
-from px4fuse.batch.page import format_html
-from px4fuse.batch.rows import (
+from px4fuse.core.input_files import check_output_folder
+from px4fuse.core.reading import max_log_bytes
+from px4fuse.core.workers import MAX_MEMORY_BYTES, JobFailure, run_with_limits
+from px4fuse.core.writing import write_output_files
+from px4fuse.errors import LogError, Px4FuseError, SettingsError
+from px4fuse.filter.settings import requested_settings
+from px4fuse.request import ComparisonRequest, command_line
+
+from . import LOG_ANALYSIS_TIMEOUT_S
+from .engine import connect_to_cluster, run_jobs
+from .job import Job, LogOutcome, analyse, make_failure_row, make_file_stem
+from .logs import LogAddress, find_logs
+from .page import format_html
+from .rows import (
     STATUS_FAILED,
     STATUS_NOT_COMPARED,
     Row,
@@ -28,13 +36,6 @@ from px4fuse.batch.rows import (
     make_table,
     replace_name_by_path,
 )
-from px4fuse.core.input_files import check_output_folder
-from px4fuse.core.reading import max_log_bytes
-from px4fuse.core.workers import MAX_MEMORY_BYTES, JobFailure, run_with_limits
-from px4fuse.core.writing import write_output_files
-from px4fuse.errors import LogError, Px4FuseError, SettingsError
-from px4fuse.filter.settings import requested_settings
-from px4fuse.request import ComparisonRequest, command_line
 
 # Table columns with the paths of the outputs of a log, relative to the output folder
 OUTPUT_FILE_COLUMNS = ("results", "report")

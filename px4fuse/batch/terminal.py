@@ -1,18 +1,19 @@
 """Terminal output of ``px4fuse batch`` and ``px4fuse diff``."""
 
-from px4fuse.batch.changes import (
-    MIN_DIFFERENCE_OF_LISTED_NUMBERS,
-    MIN_RELATIVE_DIFFERENCE_OF_LISTED_NUMBERS,
-)
-from px4fuse.batch.page import SIGMA_RATIO_LABELS, LogSummary, sort_logs, summarise_logs
-from px4fuse.batch.rows import STATUS_FAILED
-from px4fuse.batch.run import BatchResult
 from px4fuse.core.text import capitalise_first_letter, format_count, format_number, format_ratio
 from px4fuse.filter.signals import AISLE_AXIS
 from px4fuse.report.card_text import SEVERITY_SIGNS
 from px4fuse.report.page import Cell, Page, styled_text
 from px4fuse.report.style import MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.contract import ConfidenceInterval, DiffResults
+
+from .changes import (
+    MIN_DIFFERENCE_OF_LISTED_NUMBERS,
+    MIN_RELATIVE_DIFFERENCE_OF_LISTED_NUMBERS,
+)
+from .page import SIGMA_RATIO_LABELS, LogSummary, sort_logs, summarise_logs
+from .rows import STATUS_FAILED
+from .run import BatchResult
 
 MAX_LISTED_REASONS = 8
 MAX_LISTED_LOGS = 40

@@ -10,27 +10,6 @@ from typing import Any
 from msgspec.structs import replace
 
 from px4fuse.analysis import AidingSourceAnalysis, Analysis
-from px4fuse.card.causes import (
-    RankedCause,
-    can_show_effect,
-    make_cause,
-    make_cause_without_reruns,
-    rank_causes,
-)
-from px4fuse.card.model import (
-    MAX_CAUSES_ON_CARD,
-    MAX_HEADLINE_LENGTH,
-    Action,
-    AidConsistency,
-    AnalysisDescription,
-    CardSeverity,
-    DiagnosedCause,
-    DiagnosisCard,
-    FlightErrors,
-    Note,
-    Verdict,
-)
-from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.comparison.flight_events import MIN_GAP_S
 from px4fuse.comparison.model import (
     FILTER_NAMES,
@@ -65,6 +44,28 @@ from px4fuse.request import (
     command_line,
     replace_argument_names,
 )
+
+from .causes import (
+    RankedCause,
+    can_show_effect,
+    make_cause,
+    make_cause_without_reruns,
+    rank_causes,
+)
+from .model import (
+    MAX_CAUSES_ON_CARD,
+    MAX_HEADLINE_LENGTH,
+    Action,
+    AidConsistency,
+    AnalysisDescription,
+    CardSeverity,
+    DiagnosedCause,
+    DiagnosisCard,
+    FlightErrors,
+    Note,
+    Verdict,
+)
+from .verdicts import make_sigma_verdicts
 
 MAX_ACTIONS = 3
 # The diagnosis card states the fraction of rejected positions if it is at least this value

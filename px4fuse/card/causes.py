@@ -7,7 +7,6 @@ from typing import NamedTuple
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import Action, ActionTarget, CardRerun, DiagnosedCause, Verdict
 from px4fuse.comparison.changes import SIGMA_A_KEY, SIGMA_Z_KEY
 from px4fuse.comparison.model import FilterName
 from px4fuse.comparison.remedy import make_delay_change, select_changed_settings
@@ -32,6 +31,8 @@ from px4fuse.findings.model import FINDING_CATALOGUE, WRONG_CONVENTION_KEY
 from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
 from px4fuse.flight.model import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
+
+from .model import Action, ActionTarget, CardRerun, DiagnosedCause, Verdict
 
 SETTING_CHANGE_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
 # Changes that shift the positions: only ground truth shows their effect

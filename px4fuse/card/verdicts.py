@@ -6,12 +6,13 @@ against ground truth.
 
 import numpy as np
 
-from px4fuse.card.model import Verdict
 from px4fuse.comparison.comparison import compute_normalised_errors
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, FilterName, FilterSummary
 from px4fuse.core.arrays import Array, rms
 from px4fuse.filter.consistency import Reference, classify_sigma_ratio, compute_sigma_ratio_interval
 from px4fuse.flight.model import Unavailable
+
+from .model import Verdict
 
 # Length (s) of the bootstrap blocks: longer than the usual correlation time of position errors
 BOOTSTRAP_BLOCK_DURATION_S = 10.0

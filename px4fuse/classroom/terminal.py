@@ -3,12 +3,13 @@
 from collections import Counter
 from pathlib import Path
 
-from px4fuse.classroom.assignment.key import AnswerKey
-from px4fuse.classroom.grading.grade import GradeOutcome
 from px4fuse.core.text import format_count, shorten_to_line
 from px4fuse.errors import to_one_line
 from px4fuse.report.page import Page
 from px4fuse.report.style import GOOD_COLOUR, SEVERITY_COLOURS
+
+from .assignment.key import AnswerKey
+from .grading.grade import GradeOutcome
 
 
 def assignment_page(key: AnswerKey, folder: Path, key_file: Path, written_count: int) -> Page:

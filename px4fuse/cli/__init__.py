@@ -13,7 +13,6 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.outputs import Interrupted, describe_written_files
 from px4fuse.core.input_files import protect_inputs
 from px4fuse.core.threads import ONE_THREAD_ENVIRONMENT
 from px4fuse.errors import OutputError, Px4FuseError, SettingsError, suggest_name, to_one_line
@@ -24,6 +23,8 @@ from px4fuse.request import (
     LoopRequest,
     replace_argument_names,
 )
+
+from .outputs import Interrupted, describe_written_files
 
 # Commands in the order of --help; command NAME is the function NAME in cli/NAME.py
 COMMANDS = (

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.options import log_argument, output_option
-from px4fuse.cli.outputs import write_new_file
+from .options import log_argument, output_option
+from .outputs import write_new_file
 
 
 @click.command()

@@ -6,9 +6,10 @@ from typing import Any, Literal
 
 import click
 
-from px4fuse.cli import options, outputs
 from px4fuse.errors import SettingsError
 from px4fuse.finding import SEVERITIES, Severity
+
+from . import options, outputs
 
 FAIL_ON_LEVELS = ("failed", *SEVERITIES)
 

@@ -6,11 +6,12 @@ from typing import Any
 
 import click
 
-from px4fuse.cli import options, outputs
 from px4fuse.core.writing import STANDARD_OUTPUT
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.finding import SEVERITIES, Severity
 from px4fuse.request import format_settings_suffix
+
+from . import options, outputs
 
 
 @click.command()

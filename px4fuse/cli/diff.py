@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli import options, outputs
+from . import options, outputs
 
 
 @click.command()

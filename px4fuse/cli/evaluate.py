@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli import options, outputs
 from px4fuse.errors import SettingsError
 from px4fuse.request import EvaluationRequest, format_settings_suffix
+
+from . import options, outputs
 
 if TYPE_CHECKING:
     from px4fuse.trajectory.scores import RpePairDistance

@@ -2,7 +2,7 @@
 
 import click
 
-from px4fuse.cli.outputs import write_and_print_results
+from .outputs import write_and_print_results
 
 
 @click.command()

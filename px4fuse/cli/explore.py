@@ -5,9 +5,10 @@ from typing import Any
 
 import click
 
-from px4fuse.cli import options, outputs
-from px4fuse.cli.sample import sample_log
 from px4fuse.request import format_settings_suffix
+
+from . import options, outputs
+from .sample import sample_log
 
 
 @click.command()

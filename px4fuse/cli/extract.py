@@ -7,17 +7,18 @@ from typing import Any
 
 import click
 
-from px4fuse.cli.options import (
+from px4fuse.core.input_files import check_output_folder, protect_inputs
+from px4fuse.core.reading import read_text
+from px4fuse.errors import OutputError, to_one_line
+
+from .options import (
     Choice,
     comparison_request,
     flight_options,
     log_argument,
     output_option,
 )
-from px4fuse.cli.outputs import write_outputs
-from px4fuse.core.input_files import check_output_folder, protect_inputs
-from px4fuse.core.reading import read_text
-from px4fuse.errors import OutputError, to_one_line
+from .outputs import write_outputs
 
 # Maximum size (bytes) of the flight.json of an earlier export
 MAX_DESCRIPTION_BYTES = 50_000_000

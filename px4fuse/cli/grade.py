@@ -6,7 +6,11 @@ from typing import Any
 
 import click
 
-from px4fuse.cli.options import (
+from px4fuse.core.input_files import check_output_folder, register_input_path
+from px4fuse.core.reading import list_files_recursively
+from px4fuse.errors import OutputError, SettingsError
+
+from .options import (
     Choice,
     InputPath,
     NonEmptyPath,
@@ -17,10 +21,7 @@ from px4fuse.cli.options import (
     open_option,
     output_option,
 )
-from px4fuse.cli.outputs import folder_progress, write_and_print_results, write_new_file
-from px4fuse.core.input_files import check_output_folder, register_input_path
-from px4fuse.core.reading import list_files_recursively
-from px4fuse.errors import OutputError, SettingsError
+from .outputs import folder_progress, write_and_print_results, write_new_file
 
 
 @click.command()

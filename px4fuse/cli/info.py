@@ -5,14 +5,14 @@ from typing import Any
 
 import click
 
-from px4fuse.cli.options import (
+from .options import (
     comparison_request,
     flag_option,
     flight_options,
     json_option,
     log_argument,
 )
-from px4fuse.cli.outputs import make_result_files, progress, write_and_print_results
+from .outputs import make_result_files, progress, write_and_print_results
 
 
 def _print_versions(context: click.Context, _: click.Parameter, is_requested: bool) -> None:

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from px4fuse.cli import options, outputs
 from px4fuse.core.reading import display_name, split_path_and_part
 from px4fuse.core.writing import STANDARD_OUTPUT
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.request import GivenClosure, Landing, LoopRequest, command_line, format_settings_suffix
+
+from . import options, outputs
 
 if TYPE_CHECKING:
     from px4fuse.loop.model import Loop

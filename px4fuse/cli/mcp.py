@@ -16,7 +16,6 @@ from typing import Any, get_args
 
 import click
 
-from px4fuse.cli import TERMINATION_SIGNALS, cli, find_command, help_text, options, outputs
 from px4fuse.core.reading import (
     check_readable,
     max_log_bytes,
@@ -24,6 +23,8 @@ from px4fuse.core.reading import (
     split_path_and_part,
 )
 from px4fuse.errors import SettingsError
+
+from . import TERMINATION_SIGNALS, cli, find_command, help_text, options, outputs
 
 # Arguments of MCP tools whose names differ from the parameters of the px4fuse commands
 TOOL_ARGUMENT_BY_PARAMETER = {

@@ -19,7 +19,6 @@ from click.core import ParameterSource
 from msgspec import Struct, structs
 
 from px4fuse.batch import LOG_ANALYSIS_TIMEOUT_S
-from px4fuse.cli.outputs import OPENS_OUTPUT_KEY
 from px4fuse.core.input_files import register_input_path
 from px4fuse.core.reading import (
     max_log_bytes,
@@ -36,6 +35,8 @@ from px4fuse.core.text import (
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import SETTING_RANGES
 from px4fuse.request import AUTO, OPTION_NAMES, ComparisonRequest, PositionFile
+
+from .outputs import OPENS_OUTPUT_KEY
 
 if TYPE_CHECKING:
     from px4fuse.results.model import Student

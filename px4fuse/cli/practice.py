@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.options import count_option, output_option
-from px4fuse.cli.outputs import (
+from .options import count_option, output_option
+from .outputs import (
     OPENS_OUTPUT_KEY,
     check_default_page,
     choose_web_page_path,

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.options import output_option
-from px4fuse.cli.outputs import write_and_print_results
+from .options import output_option
+from .outputs import write_and_print_results
 
 SAMPLES_FOLDER = Path("sample_logs")
 SAMPLE_LOG = "aisle_uwb.ulg"

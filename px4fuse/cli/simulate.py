@@ -7,16 +7,6 @@ from typing import Any, get_args
 
 import click
 
-from px4fuse.cli.options import (
-    Choice,
-    NonEmptyPath,
-    NumberWithUnit,
-    flag_option,
-    input_option,
-    list_given_parameters,
-    output_option,
-)
-from px4fuse.cli.outputs import check_output_paths, progress, write_and_print_results
 from px4fuse.core.input_files import check_output_folder
 from px4fuse.core.reading import read_text
 from px4fuse.errors import OutputError, SettingsError
@@ -29,6 +19,17 @@ from px4fuse.simulation.scenario import (
     collect_field_bounds,
     make_scenario,
 )
+
+from .options import (
+    Choice,
+    NonEmptyPath,
+    NumberWithUnit,
+    flag_option,
+    input_option,
+    list_given_parameters,
+    output_option,
+)
+from .outputs import check_output_paths, progress, write_and_print_results
 
 _DEFAULT_SCENARIO = Scenario()
 MIXED_KIND = "mixed"

@@ -5,9 +5,10 @@ from typing import Any
 
 import click
 
-from px4fuse.cli.options import analysis_options, comparison_request, json_option, log_argument
-from px4fuse.cli.outputs import make_result_files, progress, write_and_print_results
 from px4fuse.core.record import Unavailable
+
+from .options import analysis_options, comparison_request, json_option, log_argument
+from .outputs import make_result_files, progress, write_and_print_results
 
 
 @click.command()

@@ -6,15 +6,16 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.options import InputPath, json_option, max_size_option, open_option, output_option
-from px4fuse.cli.outputs import (
+from px4fuse.core.reading import display_name, hash_files, read_bytes_limited
+from px4fuse.errors import LogError
+
+from .options import InputPath, json_option, max_size_option, open_option, output_option
+from .outputs import (
     check_output_paths,
     make_result_files,
     progress,
     write_and_print_results,
 )
-from px4fuse.core.reading import display_name, hash_files, read_bytes_limited
-from px4fuse.errors import LogError
 
 # Maximum time (s) to repeat an analysis; a flight of 10 minutes takes about 60 s
 ANALYSIS_TIMEOUT_S = 1800.0

@@ -6,9 +6,10 @@ from typing import Any
 
 import click
 
-from px4fuse.cli import options, outputs
 from px4fuse.errors import SettingsError
 from px4fuse.request import Sweep, WhatIfRequest
+
+from . import options, outputs
 
 _SWEEP_PATTERN = re.compile("([^=]*)=([^:]*):([^:]*)(?::([0-9]+))?")
 

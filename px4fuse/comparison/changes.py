@@ -7,14 +7,21 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from px4fuse.comparison.estimates import Estimates, TuningByAxis, find_first_available_tuning
-from px4fuse.comparison.model import Comparison, FilterSummary
-from px4fuse.comparison.remedy import (
+from px4fuse.ekf2.inputs import ReplayInputs
+from px4fuse.filter.frame_rotation import HeadingError
+from px4fuse.filter.settings import Settings
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.flight.ekf2_parameters import GNSS_VEL, MODEL_PARAMETERS
+from px4fuse.flight.model import LogInfo, Unavailable
+
+from .estimates import Estimates, TuningByAxis, find_first_available_tuning
+from .model import Comparison, FilterSummary
+from .remedy import (
     make_delay_max_change,
     make_estimated_delay_change,
     make_estimated_noise_change,
 )
-from px4fuse.comparison.rerun_effects import (
+from .rerun_effects import (
     CHANGE_KEYS_WITHOUT_EFFECT_ALONE,
     CONSISTENCY_STATISTICS,
     FORWARD_BIAS_KEY,
@@ -25,12 +32,6 @@ from px4fuse.comparison.rerun_effects import (
     ChangedValues,
     Statistic,
 )
-from px4fuse.ekf2.inputs import ReplayInputs
-from px4fuse.filter.frame_rotation import HeadingError
-from px4fuse.filter.settings import Settings
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.flight.ekf2_parameters import GNSS_VEL, MODEL_PARAMETERS
-from px4fuse.flight.model import LogInfo, Unavailable
 
 # Minimum SIGMA_Z (m) in a re-run of KF: the position noise of motion capture
 MIN_RERUN_SIGMA_Z_M = 0.005

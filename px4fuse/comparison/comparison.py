@@ -8,20 +8,6 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.comparison import projection
-from px4fuse.comparison.model import (
-    FILTER_NAMES,
-    AxisComparison,
-    Comparison,
-    ErrorsAgainstTruth,
-    FilterDifference,
-    FilterName,
-    FilterSummary,
-    FilterTracks,
-    PreparedComparison,
-    UntestedFilter,
-    UpdateStatistics,
-)
 from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import HorizontalNis, assess_horizontal_nis
 from px4fuse.filter.kalman import KfRun, predict_track, run_kf
@@ -33,6 +19,21 @@ from px4fuse.flight.model import (
     TableOrUnavailable,
     Unavailable,
     compute_sample_rate_hz,
+)
+
+from . import projection
+from .model import (
+    FILTER_NAMES,
+    AxisComparison,
+    Comparison,
+    ErrorsAgainstTruth,
+    FilterDifference,
+    FilterName,
+    FilterSummary,
+    FilterTracks,
+    PreparedComparison,
+    UntestedFilter,
+    UpdateStatistics,
 )
 
 INNOVATION_COLUMNS = ["innovation_m", "innovation_variance_m2"]

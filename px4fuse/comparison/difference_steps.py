@@ -7,9 +7,6 @@ from typing import Any
 import numpy as np
 from msgspec import structs
 
-from px4fuse.comparison.estimates import TuningByAxis, find_first_available_tuning
-from px4fuse.comparison.model import AxisComparison, Comparison
-from px4fuse.comparison.remedy import find_used_noise_m
 from px4fuse.core.text import format_count
 from px4fuse.ekf2 import steps
 from px4fuse.ekf2.filter_batch import FilterConfiguration
@@ -24,6 +21,10 @@ from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.model import Spans, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
+
+from .estimates import TuningByAxis, find_first_available_tuning
+from .model import AxisComparison, Comparison
+from .remedy import find_used_noise_m
 
 # Below this relative difference, the position RMSEs of KF and EKF2 are reported as equal
 MAX_RELATIVE_RMSE_DIFFERENCE = 0.05

@@ -11,7 +11,6 @@ import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.interpolate import CubicSpline
 
-from px4fuse.comparison.model import Comparison
 from px4fuse.core.arrays import (
     Array,
     compute_median_interval_s,
@@ -23,6 +22,8 @@ from px4fuse.filter.signals import interpolate_attitude
 from px4fuse.flight.model import Columns, Ekf2, Unavailable, rows_between
 from px4fuse.trajectory.rotation import conjugate, multiply, to_rotation_vector
 from px4fuse.trajectory.scores import compute_autocorrelation_time
+
+from .model import Comparison
 
 MIN_POSITIONS = 100
 # Rows of the four neighbours of a position, relative to the row of the position

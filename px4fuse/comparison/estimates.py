@@ -10,13 +10,6 @@ import numpy as np
 from msgspec import structs
 from scipy.special import stdtr
 
-from px4fuse.comparison.imu_oscillation import ImuOscillation, find_imu_oscillation
-from px4fuse.comparison.model import Comparison, PreparedComparison
-from px4fuse.comparison.noise_differences import (
-    NoisyFlightPart,
-    find_noisy_flight_part,
-    tune_perpendicular_axes,
-)
 from px4fuse.core.arrays import Array, compute_median_interval_s
 from px4fuse.filter.correlated_noise import (
     SourceLowPass,
@@ -41,6 +34,14 @@ from px4fuse.filter.time_offset import (
 )
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
+
+from .imu_oscillation import ImuOscillation, find_imu_oscillation
+from .model import Comparison, PreparedComparison
+from .noise_differences import (
+    NoisyFlightPart,
+    find_noisy_flight_part,
+    tune_perpendicular_axes,
+)
 
 # Minimum IMU rate (Hz) to estimate a time offset
 MIN_TIME_OFFSET_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from px4fuse.comparison.model import Comparison
 from px4fuse.core.arrays import Array, select_intervals
 from px4fuse.core.record import Span
 from px4fuse.flight.model import Ekf2, Flight, Unavailable
+
+from .model import Comparison
 
 # Minimum length (s) of a gap in the position source
 MIN_GAP_S = 1.0

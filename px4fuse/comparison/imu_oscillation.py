@@ -4,10 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.arrays import compute_median_interval_s, integrate_cumulatively
 from px4fuse.filter.frame_rotation import heading_rad
 from px4fuse.flight.model import Columns, Unavailable
+
+from .model import PreparedComparison
 
 MIN_POSITIONS = 100
 # Minimum and maximum tested frequency (Hz), and maximum tested frequency ÷ rate of the positions

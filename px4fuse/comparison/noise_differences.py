@@ -7,12 +7,13 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from px4fuse.comparison.model import AxisComparison, Comparison, select_north_and_east
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.signals import Axis, make_horizontal_axis
 from px4fuse.filter.tuning import AxisTuning, tune
 from px4fuse.flight.model import Unavailable
+
+from .model import AxisComparison, Comparison, select_north_and_east
 
 # Minimum ratio of the mean NIS along north and east, for separate noise estimates
 MIN_AXIS_NIS_RATIO = 1.7

@@ -6,8 +6,6 @@ from dataclasses import replace
 import numpy as np
 from msgspec import structs
 
-from px4fuse.comparison.model import PreparedComparison
-from px4fuse.comparison.projection import find_observation_variance
 from px4fuse.convention.check import determine_source_convention
 from px4fuse.convention.correction import convert_to_px4_convention, find_convention_faults
 from px4fuse.convention.model import Convention
@@ -48,6 +46,9 @@ from px4fuse.readers.px4_positions import NO_FIX_ACTION
 from px4fuse.readers.px4_topics import SOURCE_TRACK_NAMES
 from px4fuse.request import ComparisonRequest, HeightName
 from px4fuse.trajectory.rotation import to_rotation_matrix
+
+from .model import PreparedComparison
+from .projection import find_observation_variance
 
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",

@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from px4fuse.comparison.estimates import TuningByAxis, find_first_available_tuning
-from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import Ekf2Model, replay_with_settings
 from px4fuse.ekf2.replay import rows_inside
@@ -23,6 +21,9 @@ from px4fuse.flight.ekf2_parameters import (
     Aid,
 )
 from px4fuse.flight.model import Unavailable
+
+from .estimates import TuningByAxis, find_first_available_tuning
+from .model import Comparison, PreparedComparison
 
 # Tested values of EKF2_GPS_DELAY (ms)
 GNSS_DELAYS_MS = (0.0, 150.0, 300.0)

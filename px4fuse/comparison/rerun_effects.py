@@ -6,10 +6,11 @@ from typing import Literal
 
 import numpy as np
 
-from px4fuse.comparison.model import FilterName
 from px4fuse.core.record import Count, NonNegativeFloat, PositiveFloat, Record, Share
 from px4fuse.filter.consistency import Reference, classify_sigma_ratio, compute_nis_band
 from px4fuse.flight.ekf2_parameters import EV_POS
+
+from .model import FilterName
 
 Statistic = Literal["nis", "nees", "difference"]
 CONSISTENCY_STATISTICS: tuple[Statistic, Statistic] = ("nees", "nis")

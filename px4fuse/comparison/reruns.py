@@ -13,47 +13,6 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from px4fuse.comparison.changes import (
-    classify_change,
-    find_axis_tuning,
-    find_candidate_changes,
-    find_main_axis_changes,
-    remove_repeated_changes,
-)
-from px4fuse.comparison.comparison import (
-    compare,
-    compute_difference_statistics,
-    compute_error_statistics,
-    find_compared_track,
-    make_run_tracks,
-)
-from px4fuse.comparison.estimates import Estimates, TuningByAxis
-from px4fuse.comparison.model import (
-    AxisComparison,
-    Comparison,
-    ErrorsAgainstTruth,
-    FilterDifference,
-    FilterName,
-    FilterSummary,
-    PreparedComparison,
-    UntestedFilter,
-)
-from px4fuse.comparison.projection import project, project_truth
-from px4fuse.comparison.remedy import is_source_fused
-from px4fuse.comparison.rerun_effects import (
-    CONSISTENCY_STATISTICS,
-    FORWARD_BIAS_KEY,
-    MIN_REPORTED_NEES,
-    OUTLIERS_KEY,
-    RIGHT_BIAS_KEY,
-    ROTATION_KEY,
-    TIME_OFFSET_KEY,
-    ChangedValues,
-    Rerun,
-    RunStatistics,
-    Statistic,
-    find_partial_corrections,
-)
 from px4fuse.core.arrays import Array
 from px4fuse.ekf2.filter_batch import FilterConfiguration
 from px4fuse.ekf2.inputs import ReplayInputs
@@ -72,6 +31,48 @@ from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
 from px4fuse.flight.model import Columns, Spans, Unavailable
+
+from .changes import (
+    classify_change,
+    find_axis_tuning,
+    find_candidate_changes,
+    find_main_axis_changes,
+    remove_repeated_changes,
+)
+from .comparison import (
+    compare,
+    compute_difference_statistics,
+    compute_error_statistics,
+    find_compared_track,
+    make_run_tracks,
+)
+from .estimates import Estimates, TuningByAxis
+from .model import (
+    AxisComparison,
+    Comparison,
+    ErrorsAgainstTruth,
+    FilterDifference,
+    FilterName,
+    FilterSummary,
+    PreparedComparison,
+    UntestedFilter,
+)
+from .projection import project, project_truth
+from .remedy import is_source_fused
+from .rerun_effects import (
+    CONSISTENCY_STATISTICS,
+    FORWARD_BIAS_KEY,
+    MIN_REPORTED_NEES,
+    OUTLIERS_KEY,
+    RIGHT_BIAS_KEY,
+    ROTATION_KEY,
+    TIME_OFFSET_KEY,
+    ChangedValues,
+    Rerun,
+    RunStatistics,
+    Statistic,
+    find_partial_corrections,
+)
 
 # Mean NIS above which innovations are too large for the reported σ
 MAX_NORMAL_NIS = 1.5

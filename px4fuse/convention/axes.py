@@ -15,14 +15,15 @@ from typing import Final, NamedTuple
 import numpy as np
 import pandas as pd
 
-from px4fuse.convention.model import AxisDirections, Direction, HeadingSource, Unit
-from px4fuse.convention.motion import (
+from px4fuse.core.arrays import Array, ArrayPair, ComplexArray, IntArray
+
+from .model import AxisDirections, Direction, HeadingSource, Unit
+from .motion import (
     GRID_INTERVAL_S,
     SECOND_DIFFERENCE_WINDOW_S,
     ImuSecondDifferences,
     SourceSecondDifferences,
 )
-from px4fuse.core.arrays import Array, ArrayPair, ComplexArray, IntArray
 
 # Maximum tested time offset (s) of the positions
 MAX_TIME_OFFSET_S = 10.0

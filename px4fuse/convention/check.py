@@ -7,7 +7,11 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.convention.axes import (
+from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack
+from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
+from px4fuse.trajectory.rotation import heading
+
+from .axes import (
     CLOCK_DRIFT,
     DELAY,
     HEADING,
@@ -20,13 +24,13 @@ from px4fuse.convention.axes import (
     refine_hypothesis,
     search_hypotheses,
 )
-from px4fuse.convention.model import (
+from .model import (
     Convention,
     ConventionVerdict,
     HeadingSource,
     OrientationConvention,
 )
-from px4fuse.convention.motion import (
+from .motion import (
     MIN_POSITION_GAP_S,
     SECOND_DIFFERENCE_WINDOW_S,
     ImuSecondDifferences,
@@ -36,11 +40,8 @@ from px4fuse.convention.motion import (
     integrate_inertial_data,
     replace_heading,
 )
-from px4fuse.convention.orientation import determine_orientation_convention
-from px4fuse.convention.texts import format_axes, format_delay
-from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack
-from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
-from px4fuse.trajectory.rotation import heading
+from .orientation import determine_orientation_convention
+from .texts import format_axes, format_delay
 
 # For the verdict "determined", the log-likelihood (nats) of the best convention (axes, unit, delay)
 # must exceed that of the second best by this value

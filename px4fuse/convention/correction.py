@@ -8,12 +8,6 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.convention.axes import CLOCKWISE_DIRECTIONS, METRES_PER_UNIT, correct_clock_drift
-from px4fuse.convention.check import is_source_fused
-from px4fuse.convention.model import Convention
-from px4fuse.convention.motion import integrate_inertial_data, replace_heading
-from px4fuse.convention.orientation import convert_to_attitude
-from px4fuse.convention.texts import FRAME_AXES, OPPOSITE_DIRECTION, format_axes
 from px4fuse.core.arrays import Array
 from px4fuse.flight.model import (
     Columns,
@@ -23,6 +17,13 @@ from px4fuse.flight.model import (
     time_index,
 )
 from px4fuse.trajectory.rotation import build_matrix, heading
+
+from .axes import CLOCKWISE_DIRECTIONS, METRES_PER_UNIT, correct_clock_drift
+from .check import is_source_fused
+from .model import Convention
+from .motion import integrate_inertial_data, replace_heading
+from .orientation import convert_to_attitude
+from .texts import FRAME_AXES, OPPOSITE_DIRECTION, format_axes
 
 # Minimum rotation (°) that is corrected in addition to wrong axes
 MIN_RESIDUAL_ROTATION_DEG = 8.0

@@ -4,18 +4,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from px4fuse.convention.motion import (
+from px4fuse.core.arrays import Array
+from px4fuse.filter.signals import interpolate_attitude
+from px4fuse.flight.model import Columns, Flight, PositionTrack, Truth, Unavailable
+from px4fuse.trajectory.rotation import to_rotation_matrix
+from px4fuse.trajectory.scores import compute_autocorrelation_time
+
+from .motion import (
     GRID_INTERVAL_S,
     SECOND_DIFFERENCE_WINDOW_S,
     SourceSecondDifferences,
     integrate_imu_motion,
     integrate_inertial_data,
 )
-from px4fuse.core.arrays import Array
-from px4fuse.filter.signals import interpolate_attitude
-from px4fuse.flight.model import Columns, Flight, PositionTrack, Truth, Unavailable
-from px4fuse.trajectory.rotation import to_rotation_matrix
-from px4fuse.trajectory.scores import compute_autocorrelation_time
 
 # Minimum lever arm (m) that is reported: twice the noise of good UWB (0.1 m)
 MIN_REPORTED_LEVER_ARM_M = 0.2

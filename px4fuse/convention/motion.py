@@ -15,7 +15,6 @@ from itertools import pairwise
 import numpy as np
 from scipy import constants
 
-from px4fuse.convention.model import HeadingSource
 from px4fuse.core.arrays import (
     Array,
     BoolArray,
@@ -37,6 +36,8 @@ from px4fuse.trajectory.rotation import (
     to_rotation_matrix,
     to_rotation_vector,
 )
+
+from .model import HeadingSource
 
 # Interval T (s) of a second difference p(t + T) - 2 p(t) + p(t - T)
 SECOND_DIFFERENCE_WINDOW_S = 2.0

@@ -10,8 +10,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from px4fuse.convention.model import BodyAndWorldFrame, OrientationConvention, QuaternionOrder
-from px4fuse.convention.motion import InertialData
 from px4fuse.core.arrays import Array
 from px4fuse.ekf2.replay import is_inside_spans
 from px4fuse.trajectory.rotation import (
@@ -21,6 +19,9 @@ from px4fuse.trajectory.rotation import (
     multiply,
     to_rotation_matrix,
 )
+
+from .model import BodyAndWorldFrame, OrientationConvention, QuaternionOrder
+from .motion import InertialData
 
 IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
 # Quaternion (w, x, y, z) of half a turn about x, from FLU to FRD

@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from px4fuse.convention.axes import METRES_PER_UNIT
-from px4fuse.convention.model import AxisDirections, Direction, Unit
+from .axes import METRES_PER_UNIT
+from .model import AxisDirections, Direction, Unit
 
 # The opposite of each direction has the same index in the reversed tuple
 DIRECTIONS: tuple[Direction, ...] = ("north", "east", "down", "up", "west", "south")

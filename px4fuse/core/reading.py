@@ -15,8 +15,9 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
-from px4fuse.core.input_files import register_input_path
 from px4fuse.errors import LogError, Px4FuseError, suggest_name, to_one_line
+
+from .input_files import register_input_path
 
 if sys.version_info >= (3, 14):
     from compression import zstd

@@ -14,7 +14,7 @@ from typing import Any
 
 import msgspec
 
-from px4fuse.core.record import read_toml
+from .record import read_toml
 
 _UNIT_TABLES = read_toml(__file__, dict[str, dict[str, Any]], "units.toml")
 # Full name of each unit, by its symbol

@@ -18,9 +18,10 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
-from px4fuse.core.text import shorten_to_line
-from px4fuse.core.threads import ONE_THREAD_ENVIRONMENT
 from px4fuse.errors import Px4FuseError
+
+from .text import shorten_to_line
+from .threads import ONE_THREAD_ENVIRONMENT
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

@@ -8,8 +8,9 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from px4fuse.core.input_files import check_outputs
 from px4fuse.errors import OutputError
+
+from .input_files import check_outputs
 
 STANDARD_OUTPUT = Path("-")
 # Windows does not replace a file that another program has open

@@ -21,10 +21,11 @@ from px4fuse.core.record import (
     Share,
     Span,
 )
-from px4fuse.ekf2.heights import GNSS_HEIGHT_NOISE_FACTOR
 from px4fuse.filter.consistency import Consistency, classify_mean_nis, compute_nis_band
 from px4fuse.flight.ekf2_parameters import AIDS, Aid
 from px4fuse.flight.model import AidLog, Flight, Unavailable, longest_flight, sample_step_function
+
+from .heights import GNSS_HEIGHT_NOISE_FACTOR
 
 AidVerdict = Literal[
     "consistent",

@@ -11,10 +11,11 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray, integrate_cumulatively
-from px4fuse.ekf2.bias import POSITION_BIAS_NOISE_M_PER_SQRT_S
-from px4fuse.ekf2.replay_segments import INNOVATION_LOW_PASS_TIME_CONSTANT_S
 from px4fuse.flight.ekf2_parameters import BAROMETER
 from px4fuse.flight.model import GROUND_EFFECT_FLAG, Ekf2, FusionRecord
+
+from .bias import POSITION_BIAS_NOISE_M_PER_SQRT_S
+from .replay_segments import INNOVATION_LOW_PASS_TIME_CONSTANT_S
 
 # Default rate (Hz) at which EKF2 fuses the barometer, PX4 v1.15 and later
 BAROMETER_FUSION_RATE_HZ = 10.0

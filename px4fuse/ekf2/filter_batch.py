@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from px4fuse.ekf2.inputs import ReplayInputs
-from px4fuse.ekf2.intervals import EventIntervals, FusionDelays
-from px4fuse.ekf2.replay_segments import ReplaySegment
 from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, GNSS_POS
+
+from .inputs import ReplayInputs
+from .intervals import EventIntervals, FusionDelays
+from .replay_segments import ReplaySegment
 
 # EKF2 parameters with these prefixes do not change the vertical innovations
 PARAMETER_PREFIXES_WITHOUT_HEIGHT_EFFECT = (

@@ -17,16 +17,18 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from px4fuse.core.arrays import Array, Array32, ArrayPair, BoolArray, IntArray
-from px4fuse.ekf2.filter_batch import FilterBatch, FilterConfiguration
-from px4fuse.ekf2.heights import (
+from px4fuse.flight.ekf2_parameters import FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
+
+from .filter_batch import FilterBatch, FilterConfiguration
+from .heights import (
     GNSS_HEIGHT_NOISE_FACTOR,
     MIN_INNOVATION_GATE,
     MIN_MEASUREMENT_NOISE_SIGMA,
     BadAccelerationFlag,
     HeightFilter,
 )
-from px4fuse.ekf2.inputs import ReplayInputs
-from px4fuse.ekf2.intervals import (
+from .inputs import ReplayInputs
+from .intervals import (
     FUSE,
     NO_ACTION,
     START_FUSION,
@@ -34,13 +36,13 @@ from px4fuse.ekf2.intervals import (
     FusionEvents,
     make_event_intervals,
 )
-from px4fuse.ekf2.magnetometer import (
+from .magnetometer import (
     MIN_MAGNETOMETER_SIGMA_GAUSS,
     EventSamples,
     average_by_event,
     fuse_mean_sample,
 )
-from px4fuse.ekf2.replay_segments import (
+from .replay_segments import (
     ACCELEROMETER_BIAS,
     BODY_MAGNETIC_FIELD,
     EARTH_MAGNETIC_FIELD,
@@ -53,8 +55,7 @@ from px4fuse.ekf2.replay_segments import (
     ReplaySegment,
     SensorSamples,
 )
-from px4fuse.ekf2.vision import VisionFilter, set_states
-from px4fuse.flight.ekf2_parameters import FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
+from .vision import VisionFilter, set_states
 
 # Minimum state variance; prevents a division by zero
 MIN_STATE_VARIANCE = 1e-30

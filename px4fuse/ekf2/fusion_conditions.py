@@ -12,9 +12,10 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.record import Span
-from px4fuse.ekf2.intervals import MAX_DELAY_BEHIND_HORIZON_S
 from px4fuse.flight.ekf2_parameters import AID_MASK_PARAMETER, Aid
 from px4fuse.flight.model import Columns, Ekf2, PositionTrack, sample_step_function
+
+from .intervals import MAX_DELAY_BEHIND_HORIZON_S
 
 # EKF2 starts vision fusion if two samples arrive within this time (s): EV_MAX_INTERVAL
 # (ev_control.cpp, PX4 v1.14 and later)

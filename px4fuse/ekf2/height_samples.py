@@ -9,8 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from px4fuse.ekf2.barometer import find_fused_barometer_samples
-from px4fuse.ekf2.replay_segments import HeightSamples, ReplaySegment, find_sample_steps
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, GNSS_HGT, uses_aid_mask
 from px4fuse.flight.model import (
     GROUND_EFFECT_FLAG,
@@ -19,6 +17,9 @@ from px4fuse.flight.model import (
     FusionRecord,
     sample_step_function,
 )
+
+from .barometer import find_fused_barometer_samples
+from .replay_segments import HeightSamples, ReplaySegment, find_sample_steps
 
 # State index of the height
 POSITION_DOWN = 8

@@ -16,16 +16,17 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray
-from px4fuse.ekf2.bias import BiasEstimator
-from px4fuse.ekf2.filter_batch import FilterBatch
-from px4fuse.ekf2.height_samples import HEIGHT_SENSORS, POSITION_DOWN
-from px4fuse.ekf2.replay_segments import (
+from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_HGT, Aid
+
+from .bias import BiasEstimator
+from .filter_batch import FilterBatch
+from .height_samples import HEIGHT_SENSORS, POSITION_DOWN
+from .replay_segments import (
     ReplaySegment,
     group_samples_by_event,
     make_update_table,
     stack_samples,
 )
-from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_HGT, Aid
 
 # Index of the vertical axis in NED
 DOWN_AXIS = slice(2, 3)

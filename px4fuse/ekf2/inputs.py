@@ -11,16 +11,6 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray, compute_median_interval_s
-from px4fuse.ekf2.height_samples import add_heights
-from px4fuse.ekf2.replay_segments import (
-    MIN_IMU_GAP_S,
-    MIN_SEGMENT_DURATION_S,
-    ReplaySegment,
-    add_flow_samples,
-    compute_internal_to_published_position_ratio,
-    find_replay_segments,
-    read_prediction_step_s,
-)
 from px4fuse.filter.signals import interpolate_attitude
 from px4fuse.flight.ekf2_parameters import (
     AID_MASK_PARAMETER,
@@ -52,6 +42,17 @@ from px4fuse.readers.px4_innovations import has_fused_aid, replace_vision_by_gns
 from px4fuse.readers.px4_positions import MAX_DOWNSAMPLED_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE_REMEDY
 from px4fuse.trajectory.rotation import conjugate, multiply, rotate, to_rotation_matrix
+
+from .height_samples import add_heights
+from .replay_segments import (
+    MIN_IMU_GAP_S,
+    MIN_SEGMENT_DURATION_S,
+    ReplaySegment,
+    add_flow_samples,
+    compute_internal_to_published_position_ratio,
+    find_replay_segments,
+    read_prediction_step_s,
+)
 
 ANALYSIS_NAME = "EKF2 replay"
 # Note in the log of a simulated flight

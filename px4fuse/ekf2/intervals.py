@@ -20,8 +20,10 @@ from typing import Any
 import numpy as np
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.inputs import ReplayInputs
-from px4fuse.ekf2.replay_segments import (
+from px4fuse.trajectory.rotation import rotate, skew
+
+from .inputs import ReplayInputs
+from .replay_segments import (
     BIASES,
     GRAVITY_M_S2,
     MOTION_STATE_COUNT,
@@ -31,7 +33,6 @@ from px4fuse.ekf2.replay_segments import (
     VELOCITY,
     ReplaySegment,
 )
-from px4fuse.trajectory.rotation import rotate, skew
 
 # EKF2 discards a sample measured more than this time (s) before the fusion horizon
 # (pop_first_older_than, RingBuffer.h)

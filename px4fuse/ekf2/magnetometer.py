@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from px4fuse.core.arrays import Array, IntArray
-from px4fuse.ekf2.replay_segments import THETA, VELOCITY, ReplaySegment, SensorSamples
 from px4fuse.trajectory.rotation import skew
+
+from .replay_segments import THETA, VELOCITY, ReplaySegment, SensorSamples
 
 # Minimum magnetometer noise (gauss) that EKF2 uses
 MIN_MAGNETOMETER_SIGMA_GAUSS = 0.01

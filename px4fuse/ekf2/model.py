@@ -23,38 +23,6 @@ from px4fuse.core.arrays import (
     select_intervals,
 )
 from px4fuse.core.record import Span
-from px4fuse.ekf2.filter_batch import FilterConfiguration
-from px4fuse.ekf2.filter_recursion import (
-    HEADING,
-    HORIZONTAL_POSITION,
-    HORIZONTAL_POSITION_COLUMNS,
-    SegmentRun,
-    estimate_state_correlation,
-    run_segment,
-)
-from px4fuse.ekf2.heights import MIN_INNOVATION_GATE
-from px4fuse.ekf2.inputs import ANALYSIS_NAME, ReplayInputs, find_matching_samples, prepare_inputs
-from px4fuse.ekf2.intervals import make_event_intervals
-from px4fuse.ekf2.output_predictor import compute_published_state, sum_attitude_corrections
-from px4fuse.ekf2.replay import (
-    HORIZONTAL_AXES,
-    MAX_REJECTED_FRACTION_FOR_COMPARISON,
-    Ekf2Replay,
-    ReplayAgreement,
-    compare_with_log,
-    judge_agreement_with_logged_rejections,
-)
-from px4fuse.ekf2.replay_segments import (
-    ACCELEROMETER_BIAS,
-    GRAVITY_M_S2,
-    GYRO_BIAS,
-    POSITION,
-    RESTART_GAP_S,
-    THETA,
-    VELOCITY,
-    ReplaySegment,
-    make_update_table,
-)
 from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import (
     EV_POS,
@@ -68,6 +36,39 @@ from px4fuse.flight.ekf2_parameters import (
 from px4fuse.flight.model import AXIS_NAMES, Columns, Ekf2, Flight, NedAxis, Unavailable, time_index
 from px4fuse.readers.px4_innovations import replace_vision_by_gnss_innovations
 from px4fuse.trajectory.rotation import rotate
+
+from .filter_batch import FilterConfiguration
+from .filter_recursion import (
+    HEADING,
+    HORIZONTAL_POSITION,
+    HORIZONTAL_POSITION_COLUMNS,
+    SegmentRun,
+    estimate_state_correlation,
+    run_segment,
+)
+from .heights import MIN_INNOVATION_GATE
+from .inputs import ANALYSIS_NAME, ReplayInputs, find_matching_samples, prepare_inputs
+from .intervals import make_event_intervals
+from .output_predictor import compute_published_state, sum_attitude_corrections
+from .replay import (
+    HORIZONTAL_AXES,
+    MAX_REJECTED_FRACTION_FOR_COMPARISON,
+    Ekf2Replay,
+    ReplayAgreement,
+    compare_with_log,
+    judge_agreement_with_logged_rejections,
+)
+from .replay_segments import (
+    ACCELEROMETER_BIAS,
+    GRAVITY_M_S2,
+    GYRO_BIAS,
+    POSITION,
+    RESTART_GAP_S,
+    THETA,
+    VELOCITY,
+    ReplaySegment,
+    make_update_table,
+)
 
 # Maximum delay (s) of the fusion horizon: PX4's maximum of EKF2_DELAY_MAX
 MAX_HORIZON_DELAY_S = 1.0

@@ -13,14 +13,15 @@ import numpy as np
 from scipy.linalg import lapack
 
 from px4fuse.core.arrays import Array
-from px4fuse.ekf2.replay_segments import (
+from px4fuse.trajectory.rotation import rotate
+
+from .replay_segments import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
     POSITION,
     VELOCITY,
     ReplaySegment,
 )
-from px4fuse.trajectory.rotation import rotate
 
 # Gain of the integral correction of velocity and position (output_predictor.cpp)
 OUTPUT_INTEGRAL_GAIN = 0.1

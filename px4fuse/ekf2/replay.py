@@ -21,13 +21,6 @@ from px4fuse.core.record import (
     Share,
 )
 from px4fuse.core.text import format_count
-from px4fuse.ekf2.inputs import (
-    ANALYSIS_NAME,
-    find_matching_samples,
-    find_replayed_position_source,
-    innovation_topic,
-)
-from px4fuse.ekf2.replay_segments import REPLAY_SETTLING_S
 from px4fuse.filter import signals
 from px4fuse.filter.frame_rotation import heading_rad
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, FLOW, GNSS_VEL, MAG
@@ -43,6 +36,14 @@ from px4fuse.flight.model import (
     Unavailable,
 )
 from px4fuse.readers.px4_innovations import select_axis_innovations
+
+from .inputs import (
+    ANALYSIS_NAME,
+    find_matching_samples,
+    find_replayed_position_source,
+    innovation_topic,
+)
+from .replay_segments import REPLAY_SETTLING_S
 
 T = TypeVar("T", pd.DataFrame, pd.Series)
 HORIZONTAL_AXES: tuple[NedAxis, NedAxis] = ("north", "east")

@@ -19,27 +19,28 @@ import pandas as pd
 
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import NOT_IN_JSON, Count, NonNegativeFloat, NotInJson, Record, Span
-from px4fuse.ekf2.filter_batch import FilterConfiguration
-from px4fuse.ekf2.inputs import ReplayInputs
-from px4fuse.ekf2.model import (
-    Ekf2Model,
-    compute_delayed_tracks,
-    list_modelled_aids,
-    replay_with_logged_rejections,
-)
-from px4fuse.ekf2.replay import (
-    Ekf2Replay,
-    compute_rmse_to_truth,
-    interpolate_component,
-    is_inside_spans,
-    rows_inside,
-)
 from px4fuse.filter.kalman import KfRun, predict_track
 from px4fuse.filter.model import STATE_COLUMNS
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
 from px4fuse.flight.model import Columns, Ekf2, Flight, Spans, Truth, Unavailable
+
+from .filter_batch import FilterConfiguration
+from .inputs import ReplayInputs
+from .model import (
+    Ekf2Model,
+    compute_delayed_tracks,
+    list_modelled_aids,
+    replay_with_logged_rejections,
+)
+from .replay import (
+    Ekf2Replay,
+    compute_rmse_to_truth,
+    interpolate_component,
+    is_inside_spans,
+    rows_inside,
+)
 
 DIFFERENCE_ANALYSIS_NAME = "difference KF - EKF2"
 NO_TRUTH_OVERLAP = Unavailable(

@@ -12,16 +12,17 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
-from px4fuse.ekf2.bias import BiasEstimator
-from px4fuse.ekf2.filter_batch import FilterBatch, FilterConfiguration
-from px4fuse.ekf2.heights import MIN_INNOVATION_GATE, MIN_MEASUREMENT_NOISE_SIGMA
-from px4fuse.ekf2.intervals import MAX_DELAY_BEHIND_HORIZON_S
-from px4fuse.ekf2.replay_segments import (
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
+
+from .bias import BiasEstimator
+from .filter_batch import FilterBatch, FilterConfiguration
+from .heights import MIN_INNOVATION_GATE, MIN_MEASUREMENT_NOISE_SIGMA
+from .intervals import MAX_DELAY_BEHIND_HORIZON_S
+from .replay_segments import (
     group_samples_by_event,
     make_update_table,
     stack_samples,
 )
-from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
 
 # State indices of horizontal velocity and horizontal position
 HORIZONTAL_VELOCITY, HORIZONTAL_POSITION = slice(3, 5), slice(6, 8)

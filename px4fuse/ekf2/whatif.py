@@ -11,15 +11,21 @@ from numpy.typing import ArrayLike
 
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Count, NonNegativeFloat, Record, Share, one_line_repr
-from px4fuse.ekf2.height_samples import HEIGHT_SENSORS
-from px4fuse.ekf2.inputs import find_horizontal_reset_times_s
-from px4fuse.ekf2.model import (
+from px4fuse.errors import SettingsError
+from px4fuse.filter.consistency import compute_nis_band
+from px4fuse.filter.frame_rotation import heading_rad
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, MAG, check_parameters
+from px4fuse.flight.model import Columns, Ekf2, Flight, NedAxis, Spans, Unavailable
+
+from .height_samples import HEIGHT_SENSORS
+from .inputs import find_horizontal_reset_times_s
+from .model import (
     Ekf2Model,
     add_position_noise,
     list_modelled_aids,
     replay_with_settings,
 )
-from px4fuse.ekf2.replay import (
+from .replay import (
     HORIZONTAL_AXES,
     Ekf2Replay,
     ReplayAgreement,
@@ -31,11 +37,6 @@ from px4fuse.ekf2.replay import (
     rows_inside,
     select_logged_aid_innovations,
 )
-from px4fuse.errors import SettingsError
-from px4fuse.filter.consistency import compute_nis_band
-from px4fuse.filter.frame_rotation import heading_rad
-from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, MAG, check_parameters
-from px4fuse.flight.model import Columns, Ekf2, Flight, NedAxis, Spans, Unavailable
 
 ANALYSIS_NAME = "EKF2 replay with other parameters"
 # Minimum fraction of EKF2's innovations in the log to compute the longest time without fusion

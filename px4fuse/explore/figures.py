@@ -9,7 +9,6 @@ from bokeh.models import ColumnDataSource, HoverTool, Range1d
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
-from px4fuse.explore.data import PageData
 from px4fuse.report.style import (
     CONSISTENT_BAND_COLOUR,
     EKF2_COLOUR,
@@ -17,6 +16,8 @@ from px4fuse.report.style import (
     MEASUREMENT_COLOUR,
     TRUTH_COLOUR,
 )
+
+from .data import PageData
 
 
 class Plot(NamedTuple):

@@ -6,8 +6,6 @@ from importlib.metadata import version
 from bokeh.resources import Resources
 
 from px4fuse.analysis import Analysis
-from px4fuse.explore.data import ArrayEncoder, PageData, make_flight_data
-from px4fuse.explore.figures import TITLE_BY_TAB, make_document_json, select_plots
 from px4fuse.html.safe import (
     clean_texts,
     compute_csp_hash,
@@ -22,6 +20,9 @@ from px4fuse.report.card_html import (
     make_sigma_ratio_figures,
     read_card_css,
 )
+
+from .data import ArrayEncoder, PageData, make_flight_data
+from .figures import TITLE_BY_TAB, make_document_json, select_plots
 
 # Maximum length (characters) of a text from a log on the web page
 MAX_LOG_TEXT_LENGTH = 2000

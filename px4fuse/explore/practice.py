@@ -21,14 +21,15 @@ from px4fuse.comparison.preparation import prepare_comparison_inputs
 from px4fuse.core.record import Record, read_toml
 from px4fuse.core.text import capitalise_first_letter
 from px4fuse.diagnose import diagnose_comparison
-from px4fuse.explore.data import ArrayEncoder, make_flight_data
-from px4fuse.explore.page import make_data_elements, make_page_html
 from px4fuse.finding import Finding
 from px4fuse.report.card_html import make_card_html
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation import flights
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import Scenario
+
+from .data import ArrayEncoder, make_flight_data
+from .page import make_data_elements, make_page_html
 
 # Pairs of quiz answers whose faults do not hide each other in one flight
 COMBINABLE_ANSWER_PAIRS = (

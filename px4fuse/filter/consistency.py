@@ -20,7 +20,8 @@ from px4fuse.core.record import (
     Share,
     Unavailable,
 )
-from px4fuse.filter.signals import report_too_few_measurements
+
+from .signals import report_too_few_measurements
 
 # Underconfident: the reported σ is too large. Overconfident: the reported σ is too small.
 SigmaVerdict = Literal["consistent", "underconfident", "overconfident"]

@@ -21,17 +21,18 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, compute_median_interval_s
-from px4fuse.filter.fitting import (
+from px4fuse.flight.model import Flight, Unavailable
+
+from .fitting import (
     NoiseFit,
     NoiseParameters,
     fit_constant_errors,
 )
-from px4fuse.filter.hypotheses import Jump, make_unit_steps
-from px4fuse.filter.imu_motion import MotionCache, PositionsAndImuMotion, compute_imu_motion
-from px4fuse.filter.likelihood import MAX_LOG_LIKELIHOOD_DROP
-from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis, report_too_few_measurements
-from px4fuse.flight.model import Flight, Unavailable
+from .hypotheses import Jump, make_unit_steps
+from .imu_motion import MotionCache, PositionsAndImuMotion, compute_imu_motion
+from .likelihood import MAX_LOG_LIKELIHOOD_DROP
+from .settings import Settings
+from .signals import Axis, report_too_few_measurements
 
 MIN_MEASUREMENTS = 100
 # Maximum number of positions in a noise fit, from the middle of the flight

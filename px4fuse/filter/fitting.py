@@ -19,15 +19,16 @@ from scipy.optimize import minimize
 from scipy.special import chdtri, comb, expit
 
 from px4fuse.core.arrays import Array
-from px4fuse.filter.likelihood import PreintegratedMotion
-from px4fuse.filter.marginal_likelihood import (
+
+from .likelihood import PreintegratedMotion
+from .marginal_likelihood import (
     PositionFit,
     PositionsAndIncrements,
     estimate_squared_errors,
     fit_positions,
     subtract_smooth_path,
 )
-from px4fuse.filter.model import INITIAL_COVARIANCE
+from .model import INITIAL_COVARIANCE
 
 # Search range (m/s²) of SIGMA_A
 SIGMA_A_SEARCH_RANGE_M_S2 = (1e-3, 30.0)

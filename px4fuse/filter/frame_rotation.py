@@ -14,18 +14,19 @@ from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array, compute_median_interval_s
 from px4fuse.core.record import NonNegativeFloat, Record, Share
-from px4fuse.filter.fitting import NoiseParameters, fit_constant_errors, maximise_likelihood
-from px4fuse.filter.imu_motion import (
+from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
+from px4fuse.trajectory.rotation import heading
+
+from .fitting import NoiseParameters, fit_constant_errors, maximise_likelihood
+from .imu_motion import (
     MAX_IMU_INTERVAL_S,
     MIN_SEGMENT_MEASUREMENTS,
     MotionCache,
     PositionsAndImuMotion,
     compute_imu_motion,
 )
-from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Segment, cut_to_segment, report_too_few_measurements
-from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
-from px4fuse.trajectory.rotation import heading
+from .settings import Settings
+from .signals import Segment, cut_to_segment, report_too_few_measurements
 
 # Duration (s) of each flight part if the heading error is estimated from orientations
 FLIGHT_PART_DURATION_S = 2.0

@@ -22,7 +22,9 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, integrate_cumulatively
-from px4fuse.filter.likelihood import (
+from px4fuse.flight.model import Columns, Flight, Unavailable
+
+from .likelihood import (
     PreintegratedMotion,
     compute_gains,
     compute_innovations_with_gains,
@@ -30,10 +32,9 @@ from px4fuse.filter.likelihood import (
     integrate_acceleration,
     preintegrate,
 )
-from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Acceleration, Axis, report_too_few_measurements
-from px4fuse.filter.steps import make_prediction_steps
-from px4fuse.flight.model import Columns, Flight, Unavailable
+from .settings import Settings
+from .signals import Acceleration, Axis, report_too_few_measurements
+from .steps import make_prediction_steps
 
 ANALYSIS_NAME = "biases, scale factor error and jumps"
 MIN_MEASUREMENTS = 50

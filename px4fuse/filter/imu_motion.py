@@ -29,19 +29,6 @@ from px4fuse.core.arrays import (
     interpolate_columns,
 )
 from px4fuse.core.record import Span
-from px4fuse.filter.fitting import (
-    NoiseFit,
-    NoiseParameters,
-    fit_constant_errors,
-    maximise_likelihood,
-)
-from px4fuse.filter.marginal_likelihood import (
-    PositionFit,
-    PositionsAndIncrements,
-    subtract_smooth_path,
-)
-from px4fuse.filter.model import compute_continuous_process_noise_per_density
-from px4fuse.filter.signals import find_imu_gaps
 from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.trajectory.rotation import (
     conjugate,
@@ -54,6 +41,20 @@ from px4fuse.trajectory.rotation import (
     to_rotation_matrix,
     to_rotation_vector,
 )
+
+from .fitting import (
+    NoiseFit,
+    NoiseParameters,
+    fit_constant_errors,
+    maximise_likelihood,
+)
+from .marginal_likelihood import (
+    PositionFit,
+    PositionsAndIncrements,
+    subtract_smooth_path,
+)
+from .model import compute_continuous_process_noise_per_density
+from .signals import find_imu_gaps
 
 # Prior σ (rad) of the errors of tilt and heading at the start of a segment
 HEADING_SIGMA_RAD = 0.05

@@ -20,10 +20,11 @@ import pandas as pd
 
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import one_line_repr
-from px4fuse.filter import model
-from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis
-from px4fuse.filter.steps import PredictionSteps, make_prediction_steps
+
+from . import model
+from .settings import Settings
+from .signals import Axis
+from .steps import PredictionSteps, make_prediction_steps
 
 # Columns of ``KfRun.updates``
 UPDATE_TABLE_COLUMNS = [
@@ -118,7 +119,7 @@ def _run_with_filterpy(
     The values are the columns STATE_TABLE_COLUMNS and UPDATE_TABLE_COLUMNS. ``measurements_m`` is
     the measured position at the end of each step, or None.
     """
-    from px4fuse.filter.filterpy_import import KalmanFilter  # noqa: PLC0415 - takes 0.1 s
+    from .filterpy_import import KalmanFilter  # noqa: PLC0415 - takes 0.1 s
 
     kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
     kalman.x = np.array([[initial_position_m], [0.0]])

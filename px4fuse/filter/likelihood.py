@@ -14,7 +14,8 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.special import chdtri
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray
-from px4fuse.filter.model import (
+
+from .model import (
     INITIAL_COVARIANCE,
     SymmetricElements,
     compute_process_noise_per_density,
@@ -22,9 +23,9 @@ from px4fuse.filter.model import (
     propagate_state,
     update_step,
 )
-from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis
-from px4fuse.filter.steps import PredictionSteps, make_prediction_steps
+from .settings import Settings
+from .signals import Axis
+from .steps import PredictionSteps, make_prediction_steps
 
 # Log-likelihood decrease (nats) at the ends of a 95 % interval: half the 95 % point of χ²(1)
 MAX_LOG_LIKELIHOOD_DROP = float(chdtri(1, 0.05)) / 2.0

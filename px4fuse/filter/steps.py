@@ -7,9 +7,10 @@ import numpy as np
 
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.errors import SettingsError
-from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis, compute_mean_step_acceleration
 from px4fuse.flight.model import Unavailable
+
+from .settings import Settings
+from .signals import Axis, compute_mean_step_acceleration
 
 # Timestamps with a smaller difference (s) are equal: half of PX4's resolution of 1 µs
 MAX_DIFFERENCE_OF_EQUAL_TIMES_S = 5e-7

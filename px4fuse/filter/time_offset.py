@@ -17,8 +17,10 @@ from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import NOT_IN_JSON, Count, NonNegativeFloat, NotInJson, Record, Share, Span
-from px4fuse.filter.fitting import NoiseParameters, add_noises
-from px4fuse.filter.imu_motion import (
+from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
+
+from .fitting import NoiseParameters, add_noises
+from .imu_motion import (
     COARSE_SEARCH_MEASUREMENT_COUNT,
     HEADING_SIGMA_RAD,
     MAX_TESTED_TIME_OFFSET_S,
@@ -26,15 +28,14 @@ from px4fuse.filter.imu_motion import (
     PositionsAndImuMotion,
     compute_imu_motion,
 )
-from px4fuse.filter.likelihood import (
+from .likelihood import (
     MAX_LOG_LIKELIHOOD_DROP,
     compute_profile_likelihood_interval,
     fit_parabola_vertex,
 )
-from px4fuse.filter.marginal_likelihood import compute_segment_inner_products
-from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Segment, cut_to_segment, make_downsampling_slice
-from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
+from .marginal_likelihood import compute_segment_inner_products
+from .settings import Settings
+from .signals import Segment, cut_to_segment, make_downsampling_slice
 
 # Half-width (s) of the range of time offsets that is tested around the result of the coarse search
 INITIAL_SEARCH_HALF_WIDTH_S = 0.1

@@ -22,8 +22,10 @@ from px4fuse.core.record import (
     OrUnavailable,
     Record,
 )
-from px4fuse.filter.consistency import Consistency
-from px4fuse.filter.fitting import (
+from px4fuse.flight.model import Flight, Unavailable
+
+from .consistency import Consistency
+from .fitting import (
     SIGMA_A_SEARCH_RANGE_M_S2,
     SIGMA_Z_SEARCH_RANGE_M,
     NoiseFit,
@@ -32,16 +34,15 @@ from px4fuse.filter.fitting import (
     estimate_outlier_probability,
     maximise_likelihood,
 )
-from px4fuse.filter.imu_motion import MotionCache, compute_imu_motion
-from px4fuse.filter.likelihood import (
+from .imu_motion import MotionCache, compute_imu_motion
+from .likelihood import (
     PreintegratedMotion,
     find_profile_likelihood_interval,
     innovations,
     preintegrate,
 )
-from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis, make_downsampling_slice, report_too_few_measurements
-from px4fuse.flight.model import Flight, Unavailable
+from .settings import Settings
+from .signals import Axis, make_downsampling_slice, report_too_few_measurements
 
 HORIZONTAL = "horizontal"
 NoiseInterval = tuple[NonNegativeFloat, NonNegativeFloat | None]

@@ -11,7 +11,11 @@ from px4fuse.comparison.flight_events import find_airborne_spans
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.filter.signals import Segment
 from px4fuse.finding import Finding
-from px4fuse.findings import (
+from px4fuse.flight.model import Ekf2, Flight
+from px4fuse.loop.model import Loop
+from px4fuse.readers.px4_positions import NO_FIX_ACTION
+
+from . import (
     ekf2_fusion,
     ekf2_settings,
     ekf2_state,
@@ -29,10 +33,7 @@ from px4fuse.findings import (
     source_stamps,
     source_values,
 )
-from px4fuse.findings.model import group_by_cause, make_warning
-from px4fuse.flight.model import Ekf2, Flight
-from px4fuse.loop.model import Loop
-from px4fuse.readers.px4_positions import NO_FIX_ACTION
+from .model import group_by_cause, make_warning
 
 DETECTORS = (
     ekf2_fusion,

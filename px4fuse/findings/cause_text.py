@@ -21,7 +21,11 @@ from px4fuse.comparison.rerun_effects import (
 )
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import SETTING_RANGES
-from px4fuse.findings.model import (
+from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
+from px4fuse.flight.model import PositionTrack, Unavailable
+from px4fuse.request import COMPARISON_OPTIONS
+
+from .model import (
     ACCELEROMETER_CAUSE,
     CLOCK_CAUSE,
     MEASUREMENT_NOISE_CAUSE,
@@ -34,9 +38,6 @@ from px4fuse.findings.model import (
     format_percent,
     magnetometer_advice,
 )
-from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
-from px4fuse.flight.model import PositionTrack, Unavailable
-from px4fuse.request import COMPARISON_OPTIONS
 
 
 def classify_cause(analysis: Analysis, cause: Rerun | None) -> str:

@@ -25,7 +25,17 @@ from px4fuse.ekf2.fusion_conditions import (
 )
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.finding import Finding
-from px4fuse.findings.model import (
+from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
+from px4fuse.flight.model import (
+    BAD_ACCELERATION_FLAG,
+    POSITION_FILE_ORIGIN,
+    Ekf2,
+    PositionTrack,
+    Truth,
+    Unavailable,
+)
+
+from .model import (
     CAUSE_KEY,
     INNOVATION_CHANGE_CAUSE,
     SOURCE_SENSOR_CAUSE,
@@ -37,15 +47,6 @@ from px4fuse.findings.model import (
     format_percent,
     make_note,
     make_warning,
-)
-from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
-from px4fuse.flight.model import (
-    BAD_ACCELERATION_FLAG,
-    POSITION_FILE_ORIGIN,
-    Ekf2,
-    PositionTrack,
-    Truth,
-    Unavailable,
 )
 
 # Severity "error" if EKF2 fuses the positions for less than this fraction of the time

@@ -24,8 +24,11 @@ from px4fuse.core.arrays import rms
 from px4fuse.core.text import format_factor, format_metres, format_ratio
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings.cause_text import format_action
-from px4fuse.findings.model import (
+from px4fuse.flight.ekf2_parameters import AID_MASK_PARAMETER, MODEL_PARAMETERS
+from px4fuse.flight.model import Ekf2, Unavailable
+
+from .cause_text import format_action
+from .model import (
     CAUSE_KEY,
     REPORTED_VARIANCE_USED_BY_EKF2_CAUSE,
     Findings,
@@ -37,8 +40,6 @@ from px4fuse.findings.model import (
     make_warning,
     make_zero_length_spans,
 )
-from px4fuse.flight.ekf2_parameters import AID_MASK_PARAMETER, MODEL_PARAMETERS
-from px4fuse.flight.model import Ekf2, Unavailable
 
 # Severity "error" if EKF2's noise parameter is at least this factor too small or too large
 MIN_NOISE_FACTOR_FOR_SEVERITY_ERROR = 2.0

@@ -11,7 +11,19 @@ from px4fuse.comparison.flight_events import find_airborne_spans
 from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.core.text import format_metres
 from px4fuse.filter.signals import Segment, cut_to_segment
-from px4fuse.findings.model import (
+from px4fuse.flight.ekf2_parameters import MAG
+from px4fuse.flight.model import (
+    BODY_AXES,
+    Columns,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Reset,
+    Unavailable,
+    rows_between,
+)
+
+from .model import (
     CAUSE_KEY,
     SOURCE_GAP_CAUSE,
     UNKNOWN_CAUSE,
@@ -25,17 +37,6 @@ from px4fuse.findings.model import (
     make_error,
     make_warning,
     make_zero_length_spans,
-)
-from px4fuse.flight.ekf2_parameters import MAG
-from px4fuse.flight.model import (
-    BODY_AXES,
-    Columns,
-    Ekf2,
-    Flight,
-    PositionTrack,
-    Reset,
-    Unavailable,
-    rows_between,
 )
 
 # Parameter that limits a bias estimate, its unit, sensor, and columns of the bias

@@ -23,9 +23,12 @@ from px4fuse.core.text import capitalise_first_letter, format_metres, format_rat
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_text import classify_cause, format_action, rerun_refutes_cause
-from px4fuse.findings.loops import find_usable_loop
-from px4fuse.findings.model import (
+from px4fuse.flight.model import Unavailable
+from px4fuse.trajectory.alignment import fit_alignment
+
+from .cause_text import classify_cause, format_action, rerun_refutes_cause
+from .loops import find_usable_loop
+from .model import (
     CAUSE_KEY,
     Findings,
     error_if,
@@ -35,8 +38,6 @@ from px4fuse.findings.model import (
     make_error,
     make_note,
 )
-from px4fuse.flight.model import Unavailable
-from px4fuse.trajectory.alignment import fit_alignment
 
 # Minimum mean NEES, for severity "error": an RMS position error of 4 times the reported σ
 MIN_NEES_FOR_SEVERITY_ERROR = 16.0

@@ -15,7 +15,9 @@ from px4fuse.filter.hypotheses import (
 )
 from px4fuse.filter.signals import Segment, cut_to_segment, find_imu_gaps
 from px4fuse.finding import MIN_SPAN_S
-from px4fuse.findings.model import (
+from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, compute_sample_rate_hz
+
+from .model import (
     Findings,
     error_if,
     finding,
@@ -23,8 +25,7 @@ from px4fuse.findings.model import (
     make_error,
     make_warning,
 )
-from px4fuse.findings.recording import DEFAULT_SDLOG_PROFILE, VISION_PROFILE_MASK
-from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, compute_sample_rate_hz
+from .recording import DEFAULT_SDLOG_PROFILE, VISION_PROFILE_MASK
 
 # Maximum specific force (m/s²) of real sensors: 35 g, because the largest range is 32 g
 MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2 = 343.0

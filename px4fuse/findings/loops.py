@@ -2,9 +2,10 @@
 
 from px4fuse.analysis import Analysis
 from px4fuse.finding import Finding
-from px4fuse.findings.model import Findings, make_error, make_note, make_warning
 from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Loop, LoopClosure
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
+
+from .model import Findings, make_error, make_note, make_warning
 
 # Maximum fraction of rejected loop closures if the stated odometry drift is correct
 MAX_REJECTED_CLOSURE_FRACTION = 0.5

@@ -29,14 +29,19 @@ from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.finding import SEVERITIES, Finding, Severity
-from px4fuse.findings.cause_text import (
+from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, MODEL_PARAMETERS
+from px4fuse.flight.model import Columns, Unavailable, compute_sample_rate_hz
+from px4fuse.readers.px4_innovations import has_fused_aid
+from px4fuse.request import COMPARISON_OPTIONS
+
+from .cause_text import (
     classify_cause,
     format_action,
     format_kf_settings,
     rerun_refutes_cause,
 )
-from px4fuse.findings.hidden_errors import find_hidden_errors
-from px4fuse.findings.model import (
+from .hidden_errors import find_hidden_errors
+from .model import (
     CAUSE_KEY,
     MEASUREMENT_NOISE_CAUSE,
     UNKNOWN_CAUSE,
@@ -46,11 +51,7 @@ from px4fuse.findings.model import (
     lower_severity,
     make_error,
 )
-from px4fuse.findings.source_positions import has_little_motion
-from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, MODEL_PARAMETERS
-from px4fuse.flight.model import Columns, Unavailable, compute_sample_rate_hz
-from px4fuse.readers.px4_innovations import has_fused_aid
-from px4fuse.request import COMPARISON_OPTIONS
+from .source_positions import has_little_motion
 
 # Warning if a noise setting is at least this factor too small or too large
 MIN_NOISE_SETTING_TO_ESTIMATE_FACTOR = 1.5

@@ -6,8 +6,9 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.text import capitalise_first_letter, format_number
 from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
-from px4fuse.findings.model import Findings, format_occurrences, make_note, make_warning
 from px4fuse.flight.model import AS_RECEIVED_ORIGIN, Ekf2, Flight, Unavailable
+
+from .model import Findings, format_occurrences, make_note, make_warning
 
 VISION_TOPIC = "vehicle_visual_odometry"
 # SDLOG_PROFILE: default value, and mask of bit 7 for external vision (logged_topics.cpp)

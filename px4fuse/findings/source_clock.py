@@ -7,12 +7,13 @@ from px4fuse.comparison import remedy
 from px4fuse.comparison.model import FilterName, PreparedComparison
 from px4fuse.comparison.rerun_effects import Rerun
 from px4fuse.filter.time_offset import SourceTimeOffset
-from px4fuse.findings.cause_text import format_sender_action
-from px4fuse.findings.model import Findings, error_if, finding, make_error, make_warning
-from px4fuse.findings.source_positions import find_low_pass
-from px4fuse.findings.source_stamps import find_timesync_convergence
 from px4fuse.flight.ekf2_parameters import GNSS_POS, RECEIVER_DELAY_PARAMETERS
 from px4fuse.flight.model import Unavailable
+
+from .cause_text import format_sender_action
+from .model import Findings, error_if, finding, make_error, make_warning
+from .source_positions import find_low_pass
+from .source_stamps import find_timesync_convergence
 
 # Minimum time offset (s) for severity "error"; it causes a position error of 0.1 m at 1 m/s
 MIN_OFFSET_FOR_SEVERITY_ERROR_S = 0.10

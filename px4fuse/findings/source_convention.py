@@ -26,7 +26,9 @@ from px4fuse.convention.texts import (
     format_delay,
 )
 from px4fuse.finding import Finding
-from px4fuse.findings.model import (
+from px4fuse.flight.model import Flight, PositionTrack
+
+from .model import (
     FINDING_CATALOGUE,
     NO_ESTIMATES_SENTENCE,
     RESET_TIME_KEY,
@@ -35,7 +37,6 @@ from px4fuse.findings.model import (
     make_error,
     make_warning,
 )
-from px4fuse.flight.model import Flight, PositionTrack
 
 # Groups of findings that are valid even if all positions are wrong
 POSITION_INDEPENDENT_FINDING_GROUPS = ("logging", "IMU")

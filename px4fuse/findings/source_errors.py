@@ -28,7 +28,9 @@ from px4fuse.core.text import format_metres, format_number, format_ratio
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
 from px4fuse.filter.correlated_noise import TimeCorrelatedNoise
 from px4fuse.filter.time_offset import SourceTimeOffset
-from px4fuse.findings.model import (
+from px4fuse.flight.model import Columns
+
+from .model import (
     WHITE_TO_ASSUMED_NOISE_RATIO_KEY,
     Findings,
     error_if,
@@ -39,16 +41,15 @@ from px4fuse.findings.model import (
     make_note,
     make_warning,
 )
-from px4fuse.findings.noises import MAX_RATIO_OF_EQUAL_NOISES, find_ekf2_noise_m
-from px4fuse.findings.source_positions import (
+from .noises import MAX_RATIO_OF_EQUAL_NOISES, find_ekf2_noise_m
+from .source_positions import (
     MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS,
     MIN_SCALE_ERROR_TO_SIGMA_RATIO,
     find_low_pass,
     has_little_motion,
     make_scale_finding,
 )
-from px4fuse.findings.source_stamps import detect_bursts
-from px4fuse.flight.model import Columns
+from .source_stamps import detect_bursts
 
 # White noise is a separate fault if its σ ÷ σ of the time-correlated noise exceeds this ratio
 MIN_WHITE_TO_CORRELATED_SIGMA_RATIO = 0.3

@@ -9,9 +9,14 @@ from px4fuse.comparison.remedy import find_aid, format_changes
 from px4fuse.core.text import lowercase_first_letter
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding
-from px4fuse.findings.ekf2_fusion import MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR
-from px4fuse.findings.ekf2_settings import find_confirmed_noise_rerun
-from px4fuse.findings.model import (
+from px4fuse.flight.ekf2_parameters import EV_CTRL_YAW_MASK, EV_POS
+from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, rows_between
+from px4fuse.trajectory.rotation import heading as heading_of
+from px4fuse.trajectory.rotation import interpolate
+
+from .ekf2_fusion import MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR
+from .ekf2_settings import find_confirmed_noise_rerun
+from .model import (
     Findings,
     compute_flag_fraction,
     error_if,
@@ -20,10 +25,6 @@ from px4fuse.findings.model import (
     make_note,
     make_warning,
 )
-from px4fuse.flight.ekf2_parameters import EV_CTRL_YAW_MASK, EV_POS
-from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, rows_between
-from px4fuse.trajectory.rotation import heading as heading_of
-from px4fuse.trajectory.rotation import interpolate
 
 # Minimum |yaw misalignment| / σ of its estimate, for a finding: flights without a fault reach 3.2
 MIN_MISALIGNMENT_SIGMAS = 4.0

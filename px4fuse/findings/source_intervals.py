@@ -16,7 +16,11 @@ from px4fuse.ekf2.aids import MAX_TIME_WITHOUT_FUSION_S
 from px4fuse.ekf2.fusion_conditions import EV_START_INTERVAL_S
 from px4fuse.filter.kalman import predict_track
 from px4fuse.finding import Finding
-from px4fuse.findings.model import (
+from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, Aid
+from px4fuse.flight.model import ALIGNED_BY_EKF2_ORIGIN, Ekf2, Unavailable, sample_step_function
+from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
+
+from .model import (
     Findings,
     error_if,
     find_source_texts,
@@ -25,9 +29,6 @@ from px4fuse.findings.model import (
     make_note,
     make_warning,
 )
-from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, Aid
-from px4fuse.flight.model import ALIGNED_BY_EKF2_ORIGIN, Ekf2, Unavailable, sample_step_function
-from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 
 # Minimum fraction of lost positions for a finding: PX4 v1.14 and later loses 0.3 %
 MIN_LOST_POSITION_FRACTION = 0.02

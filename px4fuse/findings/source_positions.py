@@ -22,8 +22,17 @@ from px4fuse.filter.hypotheses import (
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
-from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
-from px4fuse.findings.model import (
+from px4fuse.flight.ekf2_parameters import EV_POS
+from px4fuse.flight.model import (
+    Columns,
+    PositionTrack,
+    Truth,
+    Unavailable,
+    estimate_white_noise_m,
+)
+
+from .imu import MIN_IMU_RATE_HZ, is_rate_too_low
+from .model import (
     CAUSE_KEY,
     NO_ESTIMATES_SENTENCE,
     REPORTED_VARIANCE_USED_BY_EKF2_CAUSE,
@@ -39,15 +48,7 @@ from px4fuse.findings.model import (
     make_warning,
     make_zero_length_spans,
 )
-from px4fuse.findings.source_stamps import detect_arrival_timestamps
-from px4fuse.flight.ekf2_parameters import EV_POS
-from px4fuse.flight.model import (
-    Columns,
-    PositionTrack,
-    Truth,
-    Unavailable,
-    estimate_white_noise_m,
-)
+from .source_stamps import detect_arrival_timestamps
 
 # Minimum extent (m) of the positions of a moving vehicle (5th to 95th percentile)
 MIN_MOTION_RANGE_M = 0.5

@@ -10,15 +10,6 @@ from px4fuse.core.arrays import rank_correlation
 from px4fuse.core.text import format_metres
 from px4fuse.ekf2.fusion_conditions import EFFECT_BY_UNUSABLE_TIMESTAMP, find_timestamp_action
 from px4fuse.ekf2.intervals import MAX_DELAY_BEHIND_HORIZON_S
-from px4fuse.findings.model import (
-    Findings,
-    compute_flag_fraction,
-    error_if,
-    finding,
-    format_percent,
-    make_error,
-    make_warning,
-)
 from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import (
     METHODS_WITHOUT_MEASUREMENT_TIMES,
@@ -26,6 +17,16 @@ from px4fuse.flight.model import (
     ClockConversion,
     Ekf2,
     Unavailable,
+)
+
+from .model import (
+    Findings,
+    compute_flag_fraction,
+    error_if,
+    finding,
+    format_percent,
+    make_error,
+    make_warning,
 )
 
 # Maximum jitter (s) of receive times without a finding; it causes a position error of 1 cm at 1 m/s

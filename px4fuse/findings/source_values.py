@@ -20,7 +20,10 @@ from px4fuse.core.text import format_metres
 from px4fuse.ekf2.model import misalign_positions, replay_with_settings
 from px4fuse.ekf2.replay import rows_inside
 from px4fuse.finding import format_spans
-from px4fuse.findings.model import (
+from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable
+from px4fuse.readers.px4_positions import NO_FIX_ACTION
+
+from .model import (
     NO_ESTIMATES_SENTENCE,
     Findings,
     find_source_texts,
@@ -28,9 +31,7 @@ from px4fuse.findings.model import (
     make_note,
     make_warning,
 )
-from px4fuse.findings.source_intervals import describe_errors_after_gap
-from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable
-from px4fuse.readers.px4_positions import NO_FIX_ACTION
+from .source_intervals import describe_errors_after_gap
 
 # Rounding to smaller steps (m) is not reported: its errors are below the noise of UWB
 MIN_QUANTISATION_STEP_M = 0.05

@@ -28,7 +28,8 @@ from px4fuse.core.record import (
     one_line_repr,
 )
 from px4fuse.core.record import Unavailable as Unavailable  # noqa: PLC0414 - public re-export
-from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, MODEL_PARAMETERS, Aid
+
+from .ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, MODEL_PARAMETERS, Aid
 
 PositionKind = Literal["uwb", "vio", "mocap", "gnss", "unknown", "file"]
 PositionRoute = Literal[

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-from px4fuse.html.safe import (
+from .safe import (
     clean_texts,
     compute_csp_hash,
     encode_safe_json,

@@ -34,8 +34,9 @@ from px4fuse.flight.model import (
     Unavailable,
     compute_sample_rate_hz,
 )
-from px4fuse.info.tables import list_missing_data
 from px4fuse.request import ComparisonRequest, replace_argument_names
+
+from .tables import list_missing_data
 
 SCHEMA_NAME = "px4fuse-info"
 SCHEMA_VERSION = "1.0"

@@ -10,16 +10,6 @@ from px4fuse.core.record import Span
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
-from px4fuse.loop import loop_segment
-from px4fuse.loop.closure import choose_key_frames, compute_default_key_frame_spacing_m, to_z_down
-from px4fuse.loop.corrections import (
-    build_pose_graph,
-    distribute_closure_error_by_distance,
-    score_paths,
-    solve_pose_graphs,
-)
-from px4fuse.loop.model import Loop, OdometryNoise, TrueFinalPose
-from px4fuse.loop.tracks import LoopSource, find_odometry, trajectory_of
 from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import (
@@ -28,6 +18,17 @@ from px4fuse.trajectory.model import (
     cumulative_distance,
     split_by_axis,
 )
+
+from . import loop_segment
+from .closure import choose_key_frames, compute_default_key_frame_spacing_m, to_z_down
+from .corrections import (
+    build_pose_graph,
+    distribute_closure_error_by_distance,
+    score_paths,
+    solve_pose_graphs,
+)
+from .model import Loop, OdometryNoise, TrueFinalPose
+from .tracks import LoopSource, find_odometry, trajectory_of
 
 # Larger times (s) in options are UNIX times
 MIN_UNIX_TIME_S = 1e6

@@ -10,20 +10,6 @@ from px4fuse.comparison.estimates import Progress
 from px4fuse.core.arrays import Array, IntArray, rms
 from px4fuse.errors import Px4FuseError
 from px4fuse.flight.model import Unavailable
-from px4fuse.loop.closure import (
-    DOWN_DIRECTION,
-    compute_heading_change_rad,
-    distribute_by_distance,
-    remove_closure_error_by_distance,
-)
-from px4fuse.loop.model import (
-    LANDING_CLOSURE_SOURCE,
-    CorrectionName,
-    LoopClosure,
-    OdometryNoise,
-    PathResult,
-    TrueFinalPose,
-)
 from px4fuse.request import GivenClosure
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
 from px4fuse.trajectory.graph import lie
@@ -31,6 +17,21 @@ from px4fuse.trajectory.graph.covariance import gate_edges
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import ROBUST_SOLUTION_LABEL, Solution, solve
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
+
+from .closure import (
+    DOWN_DIRECTION,
+    compute_heading_change_rad,
+    distribute_by_distance,
+    remove_closure_error_by_distance,
+)
+from .model import (
+    LANDING_CLOSURE_SOURCE,
+    CorrectionName,
+    LoopClosure,
+    OdometryNoise,
+    PathResult,
+    TrueFinalPose,
+)
 
 # Minimum growth of the reported variances along the path; otherwise they are not used
 MIN_VARIANCE_GROWTH_RATIO = 2.0

@@ -7,8 +7,6 @@ from scipy.spatial.transform import Rotation
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.model import Flight, Unavailable
-from px4fuse.loop.closure import DOWN_DIRECTION, compute_heading_change_rad
-from px4fuse.loop.model import TrueFinalPose
 from px4fuse.request import Landing
 from px4fuse.trajectory.model import (
     MIN_POSES,
@@ -17,6 +15,9 @@ from px4fuse.trajectory.model import (
     format_vector,
     split_by_axis,
 )
+
+from .closure import DOWN_DIRECTION, compute_heading_change_rad
+from .model import TrueFinalPose
 
 # Time (s) over which poses are averaged on the ground
 REST_DURATION_S = 1.0

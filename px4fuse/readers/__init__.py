@@ -5,7 +5,8 @@ from pathlib import Path
 from px4fuse.core.reading import display_name, read_head, read_log_bytes
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight.model import Flight
-from px4fuse.readers.recording_table import refuse_foreign_format
+
+from .recording_table import refuse_foreign_format
 
 # Number of bytes that are read to detect the format of a file
 _FORMAT_DETECTION_BYTES = 100
@@ -38,7 +39,7 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
             raise SettingsError(
                 f"{name}: the file is a ULog, but `system` is only for MAVLink recordings."
             )
-        from px4fuse.readers.ulog import read_ulog  # noqa: PLC0415
+        from .ulog import read_ulog  # noqa: PLC0415
 
         return read_ulog(name, read_log_bytes(path))
     refuse_foreign_format(path, first_bytes, LogError)
@@ -53,6 +54,6 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
             f"{name}: the file is a trajectory or pose graph, not a flight log",
             f"Use px4fuse evaluate or px4fuse loop {name}.",
         )
-    from px4fuse.readers.mavlink import read_mavlink  # noqa: PLC0415
+    from .mavlink import read_mavlink  # noqa: PLC0415
 
     return read_mavlink(name, read_log_bytes(path), system)

@@ -9,13 +9,14 @@ import numpy as np
 from px4fuse.core.arrays import Array, BoolArray, IntArray
 from px4fuse.core.reading import display_name, read_bytes_limited
 from px4fuse.errors import TrajectoryError
-from px4fuse.readers.recording_table import decode_text, is_number, quote
-from px4fuse.readers.trajectory import MAX_COORDINATE_M, UNIT_NORM_TOLERANCE
 from px4fuse.trajectory.graph.model import (
     INITIAL_POSES_FROM_FILE,
     PoseGraph,
     compute_initial_poses,
 )
+
+from .recording_table import decode_text, is_number, quote
+from .trajectory import MAX_COORDINATE_M, UNIT_NORM_TOLERANCE
 
 MAX_FILE_BYTES = 500_000_000
 _TAGS = ("VERTEX_SE2", "VERTEX_SE3:QUAT", "EDGE_SE2", "EDGE_SE3:QUAT")

@@ -27,14 +27,15 @@ from px4fuse.flight.model import (
     Unavailable,
     UnusedData,
 )
-from px4fuse.readers import common
-from px4fuse.readers import mavlink_senders as senders
-from px4fuse.readers.mavlink_frames import (
+
+from . import common
+from . import mavlink_senders as senders
+from .mavlink_frames import (
     MAX_FRAME_BYTES,
     VEHICLE_TYPES,
     read_frames,
 )
-from px4fuse.readers.mavlink_messages import (
+from .mavlink_messages import (
     ARDUPILOT_REPLAY_UNAVAILABLE,
     ATTITUDE_LAYOUTS,
     HIGHRES_IMU_LAYOUT,
@@ -44,20 +45,20 @@ from px4fuse.readers.mavlink_messages import (
     ON_GROUND_STATE,
     REASON_BY_UNUSED_MESSAGE,
 )
-from px4fuse.readers.mavlink_positions import (
+from .mavlink_positions import (
     compute_pressure_altitude_m,
     read_positions,
     read_truth,
 )
-from px4fuse.readers.mavlink_recording import (
+from .mavlink_recording import (
     MIN_UNIX_TIME_S,
     RECEIPT_CLOCK_TEXT,
     Recording,
     map_boot_to_unix,
     read_recording,
 )
-from px4fuse.readers.px4_positions import barometer
-from px4fuse.readers.ulog_topics import NO_INSTANCE_SWITCHES, describe_dropped_samples
+from .px4_positions import barometer
+from .ulog_topics import NO_INSTANCE_SWITCHES, describe_dropped_samples
 
 VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
 # Maximum fraction of bytes outside MAVLink frames in an undamaged file

@@ -11,7 +11,8 @@ import msgspec
 
 from px4fuse.core.record import read_toml
 from px4fuse.flight.model import Unavailable
-from px4fuse.readers.common import MessageLayout, expand_layouts
+
+from .common import MessageLayout, expand_layouts
 
 AUTOPILOT_COMPONENT_ID = 1  # MAV_COMP_ID_AUTOPILOT1
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: sent by ground stations, cameras, companions

@@ -15,14 +15,15 @@ from px4fuse.flight.model import (
     Unavailable,
     find_source_origin,
 )
-from px4fuse.readers.common import (
+
+from .common import (
     MessageLayout,
     join_nearest_samples,
     read_attitude,
     read_orientation,
 )
-from px4fuse.readers.mavlink_frames import MavlinkAddress
-from px4fuse.readers.mavlink_messages import (
+from .mavlink_frames import MavlinkAddress
+from .mavlink_messages import (
     CONVERSION_BY_MAV_FRAME,
     GNSS_LAYOUTS,
     LOCAL_POSITION_LAYOUT,
@@ -32,9 +33,9 @@ from px4fuse.readers.mavlink_messages import (
     FrameConversion,
     PositionMessageType,
 )
-from px4fuse.readers.mavlink_recording import BOOT_CLOCK_TEXT, RECEIPT_CLOCK_TEXT, Recording
-from px4fuse.readers.mavlink_senders import SenderClockConversion, find_senders
-from px4fuse.readers.px4_positions import (
+from .mavlink_recording import BOOT_CLOCK_TEXT, RECEIPT_CLOCK_TEXT, Recording
+from .mavlink_senders import SenderClockConversion, find_senders
+from .px4_positions import (
     FIX_TYPE_3D,
     MIN_TRACK_SAMPLES,
     NO_FIX_ACTION,

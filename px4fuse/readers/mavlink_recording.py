@@ -18,20 +18,21 @@ from scipy.stats import theilslopes
 
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.flight.model import Columns, DataSource, time_index
-from px4fuse.readers.common import MAX_FIELD_VALUE, MIN_QUATERNION_NORM, MessageLayout
-from px4fuse.readers.mavlink_frames import (
+from px4fuse.trajectory.rotation import rotate
+
+from .common import MAX_FIELD_VALUE, MIN_QUATERNION_NORM, MessageLayout
+from .mavlink_frames import (
     MavlinkAddress,
     MavlinkFrames,
     message_name,
     wire_layout,
 )
-from px4fuse.readers.mavlink_messages import (
+from .mavlink_messages import (
     BOOT_CLOCK_MESSAGES,
     CONVERSION_BY_MAV_FRAME,
     REMEDIES,
 )
-from px4fuse.readers.ulog_topics import find_longest_increasing_subsequence
-from px4fuse.trajectory.rotation import rotate
+from .ulog_topics import find_longest_increasing_subsequence
 
 BOOT_CLOCK_TEXT = "autopilot boot clock"
 RECEIPT_CLOCK_TEXT = "autopilot boot clock, estimated from receive times"

@@ -12,8 +12,9 @@ import numpy as np
 from px4fuse.core.arrays import Array, ArrayPair, IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.flight.model import ClockConversion, Sender
-from px4fuse.readers.mavlink_frames import VEHICLE_TYPES, MavlinkAddress, MavlinkFrames
-from px4fuse.readers.mavlink_messages import (
+
+from .mavlink_frames import VEHICLE_TYPES, MavlinkAddress, MavlinkFrames
+from .mavlink_messages import (
     AUTOPILOT_COMPONENT_ID,
     AUTOPILOT_MESSAGES,
     AUTOPILOT_NAME_BY_ID,
@@ -21,7 +22,7 @@ from px4fuse.readers.mavlink_messages import (
     NO_AUTOPILOT,
     POSITION_MESSAGE_TYPES,
 )
-from px4fuse.readers.mavlink_recording import (
+from .mavlink_recording import (
     MAX_RELATIVE_CLOCK_RATE_DIFFERENCE,
     MIN_BACKWARD_STEP_AT_RESTART_S,
     MIN_UNIX_TIME_S,

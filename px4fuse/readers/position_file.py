@@ -19,8 +19,9 @@ from px4fuse.core.arrays import Array, IntArray, compute_median_interval_s
 from px4fuse.core.reading import read_bytes_limited, split_path_and_part
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight.model import NO_INVALID_ROWS, time_index
-from px4fuse.readers.common import classify_invalid_positions, estimate_quantisation_step
-from px4fuse.readers.position_names import (
+
+from .common import classify_invalid_positions, estimate_quantisation_step
+from .position_names import (
     METRES_BY_LENGTH_UNIT,
     SECONDS_BY_TIME_UNIT,
     TIME_KINDS,
@@ -31,7 +32,7 @@ from px4fuse.readers.position_names import (
     find_sigma_columns,
     read_column_name,
 )
-from px4fuse.readers.recording_table import (
+from .recording_table import (
     COLUMNS_OPTION,
     HEADERLESS_TABLE_FORMAT,
     MAX_FILE_BYTES,
@@ -43,8 +44,8 @@ from px4fuse.readers.recording_table import (
     quote,
     refuse_foreign_format,
 )
-from px4fuse.readers.ros_bag import is_bag, read_bag
-from px4fuse.readers.ulog_topics import find_longest_increasing_subsequence
+from .ros_bag import is_bag, read_bag
+from .ulog_topics import find_longest_increasing_subsequence
 
 SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
 SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]

@@ -28,13 +28,14 @@ from px4fuse.flight.model import (
     sample_step_function,
     time_index,
 )
-from px4fuse.readers.common import MessageLayout
-from px4fuse.readers.px4_innovations import (
+
+from .common import MessageLayout
+from .px4_innovations import (
     collect_innovations_by_axis,
     read_aids,
     read_enabled_aids,
 )
-from px4fuse.readers.px4_topics import (
+from .px4_topics import (
     ATTITUDE_VARIANCE_COUNT_BY_ARRAY_LENGTHS,
     DEFAULT_PROFILE_REMEDY,
     HEIGHT_BIAS_LAYOUT_BY_AID,
@@ -46,7 +47,7 @@ from px4fuse.readers.px4_topics import (
     STATUS_TOPIC,
     TOPIC_LAYOUTS,
 )
-from px4fuse.readers.ulog_topics import Topics, get_measurement_times_us
+from .ulog_topics import Topics, get_measurement_times_us
 
 VISION_TOPIC = "vehicle_visual_odometry"
 # Fields of vehicle_local_position that are 1 while the horizontal position is valid

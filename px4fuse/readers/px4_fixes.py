@@ -5,10 +5,11 @@ import pandas as pd
 
 from px4fuse.core.arrays import Array, rms
 from px4fuse.flight.model import Columns, Ekf2, Unavailable, time_index
-from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.common import interpolate_inside_time_span
-from px4fuse.readers.px4_innovations import replace_vision_by_gnss_innovations
-from px4fuse.readers.ulog_topics import Topics
+
+from . import px4_topics as px4
+from .common import interpolate_inside_time_span
+from .px4_innovations import replace_vision_by_gnss_innovations
+from .ulog_topics import Topics
 
 # Maximum time (s) between a logged fix and the EKF2 observation of the same fix
 MAX_TIME_DIFFERENCE_OF_SAME_FIX_S = 0.01

@@ -23,9 +23,10 @@ from px4fuse.flight.model import (
     Unavailable,
     sample_step_function,
 )
-from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.common import MessageLayout, assign_fields_to_columns, join_nearest_samples
-from px4fuse.readers.ulog_topics import Topics
+
+from . import px4_topics as px4
+from .common import MessageLayout, assign_fields_to_columns, join_nearest_samples
+from .ulog_topics import Topics
 
 # Maximum time (s) between innovation and variance S; PX4 logs them every 0.5 s by default
 MAX_TIME_FROM_INNOVATION_TO_VARIANCE_S = 0.6

@@ -30,7 +30,8 @@ from px4fuse.flight.model import (
     infer_position_kind,
     time_index,
 )
-from px4fuse.readers.common import (
+
+from .common import (
     classify_invalid_positions,
     estimate_quantisation_step,
     interpolate_inside_time_span,
@@ -39,10 +40,10 @@ from px4fuse.readers.common import (
     read_orientation,
     select_valid_rows,
 )
-from px4fuse.readers.px4_ekf2 import configured_step_s
-from px4fuse.readers.px4_fixes import read_unlogged_fixes, reconstruct_fixes
-from px4fuse.readers.px4_innovations import has_fused_aid
-from px4fuse.readers.px4_topics import (
+from .px4_ekf2 import configured_step_s
+from .px4_fixes import read_unlogged_fixes, reconstruct_fixes
+from .px4_innovations import has_fused_aid
+from .px4_topics import (
     FRAME_BY_FIELD_VALUE,
     FUSED_OBSERVATION_TRACK_NAME,
     GPS_POSITION_TOPIC,
@@ -53,8 +54,8 @@ from px4fuse.readers.px4_topics import (
     TRACK_SOURCES,
     find_track_layouts,
 )
-from px4fuse.readers.recording_table import MAX_VALID_UNIX_TIME_S, MIN_VALID_UNIX_TIME_S
-from px4fuse.readers.ulog_topics import MAX_PUBLICATION_LAG_S, Topics
+from .recording_table import MAX_VALID_UNIX_TIME_S, MIN_VALID_UNIX_TIME_S
+from .ulog_topics import MAX_PUBLICATION_LAG_S, Topics
 
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h

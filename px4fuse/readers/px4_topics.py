@@ -13,7 +13,8 @@ from msgspec import structs
 from px4fuse.core.record import read_toml
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.flight.model import SourceOrigin, find_source_origin
-from px4fuse.readers.common import MessageLayout, expand_layouts
+
+from .common import MessageLayout, expand_layouts
 
 
 @dataclass(frozen=True)

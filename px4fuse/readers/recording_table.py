@@ -21,7 +21,8 @@ from px4fuse.core.reading import UTF_16_BYTE_ORDER_MARKS, display_name, read_tex
 from px4fuse.core.record import read_toml
 from px4fuse.core.text import join_first_names
 from px4fuse.errors import LogError, Px4FuseError
-from px4fuse.readers.position_names import find_position_columns, read_column_name
+
+from .position_names import find_position_columns, read_column_name
 
 # Maximum size (bytes) of a position file
 MAX_FILE_BYTES = 500_000_000

@@ -16,7 +16,8 @@ from px4fuse.core.reading import (
     max_log_bytes,
 )
 from px4fuse.errors import LogError
-from px4fuse.readers.recording_table import PositionTable
+
+from .recording_table import PositionTable
 
 _BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 _PATH_MESSAGE_TYPE = "nav_msgs/msg/Path"

@@ -13,10 +13,11 @@ from scipy.spatial.transform import Rotation
 from px4fuse.core.arrays import Array
 from px4fuse.core.reading import read_head
 from px4fuse.errors import LogError, TrajectoryError
-from px4fuse.readers.position_file import PositionRecording, read_position_file
-from px4fuse.readers.recording_table import COLUMNS_OPTION, HEADERLESS_TABLE_FORMAT
-from px4fuse.readers.ros_bag import is_bag
 from px4fuse.trajectory.model import Frame, Trajectory, TrajectoryKind
+
+from .position_file import PositionRecording, read_position_file
+from .recording_table import COLUMNS_OPTION, HEADERLESS_TABLE_FORMAT
+from .ros_bag import is_bag
 
 # Maximum deviation of a valid quaternion from norm 1
 MAX_QUATERNION_NORM_ERROR = 0.1

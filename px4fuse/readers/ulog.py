@@ -15,10 +15,11 @@ from px4fuse.flight.model import (
     UnusedData,
     time_index,
 )
-from px4fuse.readers import common
-from px4fuse.readers.px4_ekf2 import read_ekf2
-from px4fuse.readers.px4_positions import FIX_TYPE_3D, barometer, read_positions, read_truth
-from px4fuse.readers.px4_topics import (
+
+from . import common
+from .px4_ekf2 import read_ekf2
+from .px4_positions import FIX_TYPE_3D, barometer, read_positions, read_truth
+from .px4_topics import (
     DEFAULT_PROFILE_REMEDY,
     GPS_POSITION_TOPIC,
     IMU_LAYOUT,
@@ -26,7 +27,7 @@ from px4fuse.readers.px4_topics import (
     UNUSED_TOPICS,
     find_track_layouts,
 )
-from px4fuse.readers.ulog_topics import (
+from .ulog_topics import (
     Topics,
     describe_dropped_samples,
     find_longest_increasing_subsequence,

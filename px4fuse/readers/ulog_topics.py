@@ -39,8 +39,9 @@ from px4fuse.flight.model import (
     sample_step_function,
     time_index,
 )
-from px4fuse.readers.common import MAX_FIELD_VALUE, MessageLayout
-from px4fuse.readers.px4_topics import IMU_LAYOUT, TOPIC_LAYOUTS, list_topics
+
+from .common import MAX_FIELD_VALUE, MessageLayout
+from .px4_topics import IMU_LAYOUT, TOPIC_LAYOUTS, list_topics
 
 _MICROSECOND_S = 1e-6
 # Maximum delay (s) from measurement to publication; otherwise, timestamp_sample is not boot time

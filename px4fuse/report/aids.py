@@ -10,10 +10,11 @@ from px4fuse.core.record import Span
 from px4fuse.core.text import format_number
 from px4fuse.ekf2.aids import AidResult, find_flight_span
 from px4fuse.flight.model import AidLog, Flight, Unavailable, sample_step_function
-from px4fuse.report import style
-from px4fuse.report.page import Cell, Page
-from px4fuse.report.panels import ON_GROUND_BAND_STYLE, draw_dots
-from px4fuse.report.phrases import VERDICT_LEGEND, format_sigma_verdict
+
+from . import style
+from .page import Cell, Page
+from .panels import ON_GROUND_BAND_STYLE, draw_dots
+from .phrases import VERDICT_LEGEND, format_sigma_verdict
 
 LEAD_TEXT = (
     "Each aiding source is tested with its innovations in flight: a mean NIS of 1 is expected. "

@@ -18,7 +18,8 @@ from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
 from px4fuse.finding import format_spans
 from px4fuse.html.safe import load_template, read_asset
-from px4fuse.report import card_text
+
+from . import card_text
 
 # SVG paths of the markers on the axis of σ ratios (actual σ ÷ reported σ)
 MARKER_SVG_PATHS = {

@@ -25,9 +25,10 @@ from px4fuse.findings.source_clock import (
     truth_refutes_offset,
 )
 from px4fuse.flight.model import Unavailable
-from px4fuse.report.page import Page, draw_legend_above
-from px4fuse.report.style import KF_BAND_COLOUR, TRACK_STYLES, Axes
 from px4fuse.results.contract import ComparisonResults
+
+from .page import Page, draw_legend_above
+from .style import KF_BAND_COLOUR, TRACK_STYLES, Axes
 
 CURVE_HEIGHT = 170.0  # points
 CURVE_TO_INTERVAL_RATIO = 1.25  # half width of the drawn curve, divided by the 95 % interval

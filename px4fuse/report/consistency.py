@@ -25,16 +25,17 @@ from px4fuse.filter.consistency import (
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings.cause_text import describe_part_explained_by_change, format_change
 from px4fuse.flight.model import Unavailable
-from px4fuse.report.page import Page, draw_legend_above, make_columns
-from px4fuse.report.panels import add_time_panel, normalised_innovations
-from px4fuse.report.phrases import (
+
+from .page import Page, draw_legend_above, make_columns
+from .panels import add_time_panel, normalised_innovations
+from .phrases import (
     VERDICT_LEGEND,
     VERDICT_TABLE_HEAD,
     format_noise_estimate,
     get_statistics_by_filter,
     make_verdict_row,
 )
-from px4fuse.report.style import (
+from .style import (
     INNOVATION_STYLES,
     TRACK_STYLES,
     Axes,

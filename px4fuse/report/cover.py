@@ -30,8 +30,10 @@ from px4fuse.filter.kalman import predict_track
 from px4fuse.filter.signals import AISLE_AXIS, cut_to_segment
 from px4fuse.finding import format_spans
 from px4fuse.flight.model import Ekf2, Truth
-from px4fuse.report import style
-from px4fuse.report.card_text import (
+from px4fuse.results.contract import AidsResults, ComparisonResults
+
+from . import style
+from .card_text import (
     AIDS_CAPTION,
     QUANTITY_LABELS,
     SEVERITY_SIGNS,
@@ -43,13 +45,13 @@ from px4fuse.report.card_text import (
     locate_sigma_ratio,
     make_rerun_rows,
 )
-from px4fuse.report.page import (
+from .page import (
     AXES_LEFT_MARGIN,
     AXES_RIGHT_MARGIN,
     Page,
     make_columns,
 )
-from px4fuse.report.panels import (
+from .panels import (
     LANDING_MARKER_STYLE,
     TAKE_OFF_MARKER_STYLE,
     add_legend,
@@ -57,8 +59,7 @@ from px4fuse.report.panels import (
     draw_dots,
     normalised_innovations,
 )
-from px4fuse.report.style import SEVERITY_COLOURS, TRACK_STYLES, draw_curve
-from px4fuse.results.contract import AidsResults, ComparisonResults
+from .style import SEVERITY_COLOURS, TRACK_STYLES, draw_curve
 
 FlightResults = ComparisonResults | AidsResults
 

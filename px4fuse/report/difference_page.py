@@ -10,9 +10,10 @@ from px4fuse.ekf2.replay import ReplayAgreement
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.flight.model import Unavailable
-from px4fuse.report.page import Page, make_columns
-from px4fuse.report.panels import add_time_panel
-from px4fuse.report.style import (
+
+from .page import Page, make_columns
+from .panels import add_time_panel
+from .style import (
     EKF2_COLOUR,
     KF_BAND_COLOUR,
     KF_COLOUR,

@@ -10,12 +10,13 @@ from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
-from px4fuse.report import style
-from px4fuse.report.page import Page, make_columns
-from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, TRUTH_COLOUR, Axes
 from px4fuse.trajectory.evaluation import AbsoluteTrajectoryError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME
 from px4fuse.trajectory.scores import RelativePoseError, RmseInterval, Statistics
+
+from . import style
+from .page import Page, make_columns
+from .style import EKF2_COLOUR, KF_COLOUR, TRUTH_COLOUR, Axes
 
 # Indices of the position axes to the right and upwards on a map, by frame
 MAP_AXIS_INDICES = {"NED": (1, 0), "FRD": (1, 0), "camera": (0, 2)}

@@ -9,7 +9,8 @@ from px4fuse.findings.model import (
     find_effect_ids,
     load_finding_examples,
 )
-from px4fuse.report.page import Page
+
+from .page import Page
 
 
 def make_findings_list() -> Page:

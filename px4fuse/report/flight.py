@@ -8,11 +8,12 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AxisComparison
 from px4fuse.core.record import Span
-from px4fuse.report import panels, style
-from px4fuse.report.difference_page import describe_missing_explanation
-from px4fuse.report.page import Page, make_columns
-from px4fuse.report.phrases import get_statistics_by_filter, list_verdict_warnings
-from px4fuse.report.style import EKF2_COLOUR, TRACK_STYLES
+
+from . import panels, style
+from .difference_page import describe_missing_explanation
+from .page import Page, make_columns
+from .phrases import get_statistics_by_filter, list_verdict_warnings
+from .style import EKF2_COLOUR, TRACK_STYLES
 
 ZOOM_UPDATE_COUNT = 15  # in the enlarged plot of σ of position
 MIN_ZOOM_DURATION_S = 1.0  # minimum duration of the enlarged plot

@@ -8,7 +8,8 @@ from matplotlib import font_manager
 from matplotlib.font_manager import FontEntry, FontPath
 
 from px4fuse.core.text import shorten_to_line
-from px4fuse.report.style import FONT
+
+from .style import FONT
 
 # Names of placeholder fonts, which draw each character as a box
 PLACEHOLDER_FONT_WORDS = ("lastresort", "last resort", "blank", "notdef")

@@ -6,10 +6,11 @@ from px4fuse.core.text import format_count, join_first_names
 from px4fuse.flight.model import Unavailable
 from px4fuse.info.inventory import Inventory, LoggedData
 from px4fuse.readers.px4_topics import RECONSTRUCTED_TRACK_NAME
-from px4fuse.report.page import Cell, Page
-from px4fuse.report.phrases import format_clock_map
-from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.request import ComparisonRequest, command_line
+
+from .page import Cell, Page
+from .phrases import format_clock_map
+from .style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 
 
 def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:

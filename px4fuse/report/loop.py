@@ -17,15 +17,21 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.loop.corrections import CORRECTION_LABELS
 from px4fuse.loop.model import Loop, PathResult
-from px4fuse.report.evaluation import (
+from px4fuse.results.contract import LoopResults
+from px4fuse.trajectory.evaluation import Evaluation
+from px4fuse.trajectory.graph.covariance import GATE_ALPHA
+from px4fuse.trajectory.graph.solver import MAX_GNC_CLOSURES, SOLUTION_LABELS, Graph
+from px4fuse.trajectory.model import AXES_OF_FRAME, format_vector
+
+from .evaluation import (
     describe_method,
     format_error,
     format_rmse,
     plot_path,
 )
-from px4fuse.report.page import Page
-from px4fuse.report.phrases import write_findings
-from px4fuse.report.style import (
+from .page import Page
+from .phrases import write_findings
+from .style import (
     EKF2_COLOUR,
     KF_COLOUR,
     SEVERITY_COLOURS,
@@ -35,11 +41,6 @@ from px4fuse.report.style import (
     line_style,
     set_map_axes,
 )
-from px4fuse.results.contract import LoopResults
-from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.trajectory.graph.covariance import GATE_ALPHA
-from px4fuse.trajectory.graph.solver import MAX_GNC_CLOSURES, SOLUTION_LABELS, Graph
-from px4fuse.trajectory.model import AXES_OF_FRAME, format_vector
 
 LEAD_TEXT = (
     "The closure error is the distance between the end of the odometry and the true end. "

@@ -7,11 +7,12 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from px4fuse.analysis import Analysis
-from px4fuse.report.cover import FlightResults
-from px4fuse.report.page import Page
-from px4fuse.report.style import MUTED_COLOUR
 from px4fuse.results.answer_form import Answers, form_rows
 from px4fuse.results.contract import LoopResults
+
+from .cover import FlightResults
+from .page import Page
+from .style import MUTED_COLOUR
 
 if TYPE_CHECKING:
     from markdown_it.token import Token

@@ -12,7 +12,8 @@ import numpy as np
 from msgspec import Struct, structs
 
 from px4fuse.core.text import with_log_name
-from px4fuse.report.style import MUTED_COLOUR, TEXT_COLOUR, Artist, Axes
+
+from .style import MUTED_COLOUR, TEXT_COLOUR, Artist, Axes
 
 PAGE_WIDTH = 178.0 * 72.0 / 25.4  # points
 COLUMN_GAP = 5.0 * 72.0 / 25.4  # points, between two columns
@@ -155,7 +156,7 @@ def draw_legend_above(axes: Axes) -> None:
 
 def replace_unprintable(text: str) -> str:
     """Replace or remove characters that cannot be printed, and split long words."""
-    from px4fuse.report import fonts  # noqa: PLC0415 - as in :meth:`Page.add_panel`
+    from . import fonts  # noqa: PLC0415 - as in :meth:`Page.add_panel`
 
     return "".join(
         character

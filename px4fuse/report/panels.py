@@ -15,10 +15,11 @@ from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight.model import Unavailable
-from px4fuse.report import style
-from px4fuse.report.page import Page, PageBlock
-from px4fuse.report.phrases import format_sigma_verdict, get_statistics_by_filter
-from px4fuse.report.style import (
+
+from . import style
+from .page import Page, PageBlock
+from .phrases import format_sigma_verdict, get_statistics_by_filter
+from .style import (
     INNOVATION_STYLES,
     REJECTED_INNOVATION_STYLE,
     TRACK_STYLES,

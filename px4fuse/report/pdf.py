@@ -6,7 +6,10 @@ from typing import Any
 
 from px4fuse.core.memory import release_free_memory
 from px4fuse.core.text import shorten_to_line
-from px4fuse.report import (
+from px4fuse.results import contract
+from px4fuse.results.model import NO_STUDENT
+
+from . import (
     aids,
     clock,
     consistency,
@@ -18,11 +21,9 @@ from px4fuse.report import (
     notes,
     provenance,
 )
-from px4fuse.report.page import Page, replace_unprintable, to_typst_data
-from px4fuse.report.style import apply_report_style
-from px4fuse.report.typesetting import compile_pdf
-from px4fuse.results import contract
-from px4fuse.results.model import NO_STUDENT
+from .page import Page, replace_unprintable, to_typst_data
+from .style import apply_report_style
+from .typesetting import compile_pdf
 
 RESULTS_NAME = "results.json"
 # Functions that draw the pages of a report, by type of results

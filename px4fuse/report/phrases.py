@@ -18,8 +18,9 @@ from px4fuse.filter.tuning import NoiseEstimate
 from px4fuse.finding import Finding, format_spans
 from px4fuse.findings.model import finding_title, split_cause_groups
 from px4fuse.flight.model import Alignment, ClockConversion, Unavailable
-from px4fuse.report.page import Cell, Page, styled_text
-from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
+
+from .page import Cell, Page, styled_text
+from .style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 
 if TYPE_CHECKING:
     from px4fuse.analysis import Analysis

@@ -6,12 +6,13 @@ from pathlib import Path
 from px4fuse.analysis import AidingSourceAnalysis, Analysis
 from px4fuse.flight.model import Flight, PositionTrack, Unavailable
 from px4fuse.loop.model import Loop
-from px4fuse.report import clock
-from px4fuse.report.cover import ALL_FINDINGS_TITLE, FlightResults
-from px4fuse.report.page import Page
-from px4fuse.report.phrases import describe_alignment, format_clock_map, write_findings
 from px4fuse.request import replace_argument_names
 from px4fuse.results.contract import LoopResults
+
+from . import clock
+from .cover import ALL_FINDINGS_TITLE, FlightResults
+from .page import Page
+from .phrases import describe_alignment, format_clock_map, write_findings
 
 LABEL_WIDTH = 168.0  # points
 

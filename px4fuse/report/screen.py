@@ -8,10 +8,11 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from px4fuse.report.card_text import CARD_WIDTH, Paragraph, to_ascii
-from px4fuse.report.page import Cell, PageBlock
-from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.request import ComparisonRequest, Request, command_line
+
+from .card_text import CARD_WIDTH, Paragraph, to_ascii
+from .page import Cell, PageBlock
+from .style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 
 # Terminal encodings that contain all characters of the printed diagnosis, for example ● and σ
 UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")

@@ -5,15 +5,16 @@ from typing import Any
 
 from px4fuse.analysis import AidingSourceAnalysis, Analysis
 from px4fuse.ekf2.steps import DifferenceExplanation
-from px4fuse.report.aids import select_aids_of_outdoor_flight, write_aids
-from px4fuse.report.card_text import (
+
+from .aids import select_aids_of_outdoor_flight, write_aids
+from .card_text import (
     Paragraph,
     format_card_lines,
     make_headline,
     with_typed_path,
 )
-from px4fuse.report.page import Page
-from px4fuse.report.phrases import (
+from .page import Page
+from .phrases import (
     VERDICT_LEGEND,
     list_verdict_warnings,
     write_error_table,

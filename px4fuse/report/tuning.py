@@ -11,8 +11,9 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.findings.noises import KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION
 from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import Columns, Unavailable
-from px4fuse.report.page import Page
-from px4fuse.report.phrases import format_noise_estimate, format_settings
+
+from .page import Page
+from .phrases import format_noise_estimate, format_settings
 
 
 def make_tuning_page(

@@ -8,9 +8,9 @@ from typing import Any
 
 import typst
 
-from px4fuse.report import fonts
-from px4fuse.report.card_text import PLACE_TEXTS
-from px4fuse.report.style import FILTER_COLOURS
+from . import fonts
+from .card_text import PLACE_TEXTS
+from .style import FILTER_COLOURS
 
 # PDF/A-3a for archives, PDF/UA-1 for screen readers
 PDF_STANDARDS: list[Any] = ["a-3a", "ua-1"]

@@ -15,8 +15,9 @@ from px4fuse.ekf2.whatif import (
 )
 from px4fuse.flight.ekf2_parameters import AIDS, MODEL_PARAMETERS
 from px4fuse.flight.model import Unavailable
-from px4fuse.report.difference_page import format_replay_agreement
-from px4fuse.report.page import Page
+
+from .difference_page import format_replay_agreement
+from .page import Page
 
 NOT_PREDICTABLE_TEXT = "not predictable"
 

@@ -2,7 +2,7 @@
 
 import sys
 
-from px4fuse.results.contract import schema, to_json
+from .contract import schema, to_json
 
 sys.stdout.reconfigure(encoding="utf-8")  # type: ignore[union-attr]
 sys.stdout.write(to_json(schema()))

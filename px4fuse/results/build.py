@@ -21,12 +21,13 @@ from px4fuse.request import (
     WhatIfRequest,
     command_line,
 )
-from px4fuse.results import contract
-from px4fuse.results.answer_form import EMPTY_CELL, Answers, form_rows
-from px4fuse.results.bounds import drop_invalid_numbers
-from px4fuse.results.model import NO_STUDENT, SCHEMA_VERSION, Schema, Student, provenance
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.solver import Graph
+
+from . import contract
+from .answer_form import EMPTY_CELL, Answers, form_rows
+from .bounds import drop_invalid_numbers
+from .model import NO_STUDENT, SCHEMA_VERSION, Schema, Student, provenance
 
 ResultsT = TypeVar("ResultsT", bound=contract.Results)
 

@@ -44,10 +44,11 @@ from px4fuse.flight.model import (
 )
 from px4fuse.loop.model import Loop
 from px4fuse.request import AxisName, ComparisonRequest, KfInputName, LoopRequest, WhatIfRequest
-from px4fuse.results.model import SCHEMA_VERSION, Provenance, Schema, Student, Version
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.solver import Graph
 from px4fuse.trajectory.model import TrajectorySummary
+
+from .model import SCHEMA_VERSION, Provenance, Schema, Student, Version
 
 # Maximum number of significant digits of a number in the results
 SIGNIFICANT_DIGITS = 10

@@ -8,7 +8,8 @@ import msgspec
 from msgspec import Meta
 
 from px4fuse.core.record import Record
-from px4fuse.results.answer_form import Answers
+
+from .answer_form import Answers
 
 # Version of the JSON schema: new fields increase the minor version, other changes the major version
 SCHEMA_VERSION = "4.0"

@@ -10,9 +10,10 @@ from msgspec.structs import fields
 from px4fuse.core.record import decode_record_or_unavailable
 from px4fuse.core.text import clean_text, convert_nested, shorten_to_line
 from px4fuse.errors import ResultsError
-from px4fuse.results.bounds import find_value_type, list_types
-from px4fuse.results.contract import RESULTS_BY_SCHEMA, Results
-from px4fuse.results.model import SCHEMA_VERSION
+
+from .bounds import find_value_type, list_types
+from .contract import RESULTS_BY_SCHEMA, Results
+from .model import SCHEMA_VERSION
 
 # Maximum size of a results file (bytes) and of an integer in the file (bits)
 MAX_RESULTS_BYTES, MAX_INTEGER_BITS = 5_000_000, 64

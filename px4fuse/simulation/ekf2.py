@@ -52,16 +52,6 @@ from px4fuse.flight.ekf2_parameters import (
     Aid,
     fill_parameters_with_defaults,
 )
-from px4fuse.simulation import sensors
-from px4fuse.simulation.ekf2_topics import (
-    VEHICLE_AID_SOURCE_LOG_RATE_HZ,
-    Ekf2Output,
-    make_ekf2_topics,
-)
-from px4fuse.simulation.faults import FaultSizes
-from px4fuse.simulation.motion import Motion
-from px4fuse.simulation.scenario import Scenario
-from px4fuse.simulation.ulog_writer import Topic
 from px4fuse.trajectory.rotation import (
     conjugate,
     cumulative_product,
@@ -71,6 +61,17 @@ from px4fuse.trajectory.rotation import (
     skew,
     to_rotation_vector,
 )
+
+from . import sensors
+from .ekf2_topics import (
+    VEHICLE_AID_SOURCE_LOG_RATE_HZ,
+    Ekf2Output,
+    make_ekf2_topics,
+)
+from .faults import FaultSizes
+from .motion import Motion
+from .scenario import Scenario
+from .ulog_writer import Topic
 
 # PX4 parameter values with which EKF2 fuses positions (GNSS: positions and velocities)
 FUSION_SWITCH_VALUES = {EV_POS.switch: 1, GNSS_POS.switch: 5}

@@ -18,7 +18,8 @@ from px4fuse.ekf2.replay_segments import POSITION
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid
 from px4fuse.readers.px4_ekf2 import MAG_3D_FUSION_BIT
 from px4fuse.readers.px4_positions import unproject
-from px4fuse.simulation.sensors import (
+
+from .sensors import (
     FIRST_TIMESTAMP_US,
     HOME_POSITION,
     is_kept_at_rate,
@@ -27,7 +28,7 @@ from px4fuse.simulation.sensors import (
     split_vectors,
     to_seconds,
 )
-from px4fuse.simulation.ulog_writer import Topic, make_topic
+from .ulog_writer import Topic, make_topic
 
 # Rate limit (Hz) of estimator_aid_src_ev_pos on a vehicle (PX4 v1.16, logged_topics.cpp)
 VEHICLE_AID_SOURCE_LOG_RATE_HZ = 2.0

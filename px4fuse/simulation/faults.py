@@ -10,7 +10,8 @@ from typing import Any
 from px4fuse.core.record import read_toml
 from px4fuse.core.text import UNIT_NAME_BY_SYMBOL, convert_to_unit
 from px4fuse.errors import SettingsError, suggest_name
-from px4fuse.simulation.scenario import (
+
+from .scenario import (
     SCENARIO_KINDS,
     ScenarioKind,
     collect_field_bounds,

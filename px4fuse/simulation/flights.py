@@ -14,11 +14,12 @@ from px4fuse.flight.ekf2_parameters import GNSS_POS
 from px4fuse.flight.model import Flight
 from px4fuse.readers.ulog import read_ulog
 from px4fuse.readers.ulog_topics import ASSIGNMENT_FLAG_KEY, NOTE_KEY
-from px4fuse.simulation import ekf2, sensors
-from px4fuse.simulation.faults import FAULT_TYPES, FaultSizes, format_fault, injected_fault_names
-from px4fuse.simulation.motion import Motion, plan_flight
-from px4fuse.simulation.scenario import Scenario
-from px4fuse.simulation.ulog_writer import Topic, encode_ulog
+
+from . import ekf2, sensors
+from .faults import FAULT_TYPES, FaultSizes, format_fault, injected_fault_names
+from .motion import Motion, plan_flight
+from .scenario import Scenario
+from .ulog_writer import Topic, encode_ulog
 
 NO_FAULTS = FaultSizes()
 # PX4 v1.16.0, whose topics are simulated, as a version number

@@ -15,8 +15,9 @@ from scipy.interpolate import BPoly, PPoly
 
 from px4fuse.core.arrays import Array
 from px4fuse.errors import SettingsError
-from px4fuse.simulation.faults import FaultSizes
-from px4fuse.simulation.scenario import CORNER_DURATION_S, SPEED_RAMP_DURATION_S, Scenario
+
+from .faults import FaultSizes
+from .scenario import CORNER_DURATION_S, SPEED_RAMP_DURATION_S, Scenario
 
 # Time (s) on the ground before take-off and after landing
 TIME_ON_GROUND_S = 6.0

@@ -15,10 +15,11 @@ from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray, integrate
 from px4fuse.flight.ekf2_parameters import GNSS_POS, MODEL_PARAMETERS
 from px4fuse.readers.px4_positions import unproject
 from px4fuse.readers.px4_topics import GPS_POSITION_TOPIC
-from px4fuse.simulation.faults import FaultSizes
-from px4fuse.simulation.motion import Motion, Sines, compute_attitude_and_imu, compute_direction
-from px4fuse.simulation.scenario import DT_S, Scenario
-from px4fuse.simulation.ulog_writer import Topic, make_topic
+
+from .faults import FaultSizes
+from .motion import Motion, Sines, compute_attitude_and_imu, compute_direction
+from .scenario import DT_S, Scenario
+from .ulog_writer import Topic, make_topic
 
 # Time since boot (µs) of the first sample
 FIRST_TIMESTAMP_US = 12_000_000

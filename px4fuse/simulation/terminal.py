@@ -5,8 +5,9 @@ from pathlib import Path
 from px4fuse.core.text import format_count
 from px4fuse.errors import to_one_line
 from px4fuse.report.page import Page
-from px4fuse.simulation.faults import FAULT_TYPES, format_fault, injected_fault_names
-from px4fuse.simulation.flights import Simulation
+
+from .faults import FAULT_TYPES, format_fault, injected_fault_names
+from .flights import Simulation
 
 PATH_AND_SOURCE_BY_KIND = {
     "aisle": ("straight path", "UWB"),

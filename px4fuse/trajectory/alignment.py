@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Count, Record, Vector
 from px4fuse.errors import TrajectoryError
-from px4fuse.trajectory.model import MIN_POSES
+
+from .model import MIN_POSES
 
 AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 

@@ -15,7 +15,8 @@ from px4fuse.core.arrays import (
 )
 from px4fuse.core.record import Count, NonNegativeFloat, Record
 from px4fuse.errors import TrajectoryError
-from px4fuse.trajectory.model import MIN_POSES, Trajectory
+
+from .model import MIN_POSES, Trajectory
 
 AssociationMethod = Literal["interpolate", "nearest"]
 

@@ -19,16 +19,17 @@ from px4fuse.core.record import NOT_IN_JSON, NotInJson, OrUnavailable, Record
 from px4fuse.core.text import capitalise_first_letter, format_metres
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
-from px4fuse.trajectory.alignment import (
+
+from .alignment import (
     AlignmentKind,
     Transform,
     compute_rms_length_m,
     fit_alignment,
     umeyama,
 )
-from px4fuse.trajectory.association import Association, AssociationMethod, associate
-from px4fuse.trajectory.model import Trajectory, compute_extent_m, cumulative_distance
-from px4fuse.trajectory.scores import (
+from .association import Association, AssociationMethod, associate
+from .model import Trajectory, compute_extent_m, cumulative_distance
+from .scores import (
     RelativePoseError,
     RmseInterval,
     RpePairDistance,
@@ -40,7 +41,7 @@ from px4fuse.trajectory.scores import (
     estimate_rmse_interval,
     get_rotations,
 )
-from px4fuse.trajectory.time_offset import TimeOffset, compute_clock_offset_s, estimate_time_offset
+from .time_offset import TimeOffset, compute_clock_offset_s, estimate_time_offset
 
 # Maximum rotation (rad) of a constant orientation, above 0 because files contain rounded numbers
 MAX_ROTATION_OF_CONSTANT_ORIENTATION_RAD = 1e-6

@@ -13,8 +13,9 @@ from px4fuse.core.arrays import Array, IntArray, compute_median_interval_s, rms
 from px4fuse.core.record import Count, NonNegativeFloat, OrUnavailable, Record
 from px4fuse.errors import SettingsError
 from px4fuse.flight.model import Unavailable
-from px4fuse.trajectory.correlation import autocovariance
-from px4fuse.trajectory.model import Trajectory, cumulative_distance
+
+from .correlation import autocovariance
+from .model import Trajectory, cumulative_distance
 
 PairDistanceUnit = Literal["frames", "m", "s"]
 

@@ -13,10 +13,11 @@ from scipy.special import stdtrit
 
 from px4fuse.core.arrays import Array, BoolArray, compute_median_interval_s, interpolate_columns
 from px4fuse.core.record import Record, Span
-from px4fuse.trajectory.alignment import Transform, compute_rms_length_m, umeyama
-from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
-from px4fuse.trajectory.correlation import autocovariance, compute_moments
-from px4fuse.trajectory.model import MIN_POSES, Trajectory
+
+from .alignment import Transform, compute_rms_length_m, umeyama
+from .association import choose_gap_limit_s, is_bracketed
+from .correlation import autocovariance, compute_moments
+from .model import MIN_POSES, Trajectory
 
 # Minimum step (s) of the time grid for the correlation of speeds
 GRID_STEP_S = 0.05

@@ -7,8 +7,9 @@ from pathlib import Path
 from px4fuse.core.text import shorten_to_line
 from px4fuse.report.page import Page
 from px4fuse.report.style import GOOD_COLOUR, SEVERITY_COLOURS
-from px4fuse.verification.model import Verification
-from px4fuse.verification.verification import VERIFICATION_SCOPE_NOTE
+
+from .model import Verification
+from .verification import VERIFICATION_SCOPE_NOTE
 
 SCHEMA = {"name": "px4fuse-verification", "version": "3.0"}
 

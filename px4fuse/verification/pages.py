@@ -29,8 +29,9 @@ from pypdf.generic import (
 
 from px4fuse.core.text import shorten_to_line
 from px4fuse.core.workers import JobFailure, run_one_with_limits
-from px4fuse.verification.model import PageDifference
-from px4fuse.verification.pdf_input import (
+
+from .model import PageDifference
+from .pdf_input import (
     BROKEN_PDF_ERRORS,
     MAX_PDF_VALUES,
     PYPDF_LIMITS,

@@ -21,7 +21,8 @@ from px4fuse.report.pdf import RESULTS_NAME
 from px4fuse.results.contract import ReportedResults, Results
 from px4fuse.results.reading import MAX_RESULTS_BYTES as MAX_ATTACHMENT_BYTES
 from px4fuse.results.reading import read_results
-from px4fuse.verification.model import BAD_VALUE_ERRORS
+
+from .model import BAD_VALUE_ERRORS
 
 MAX_PDF_BYTES = 25_000_000
 MAX_PAGES = 100

@@ -27,8 +27,9 @@ from px4fuse.results.contract import (
     to_json_dict,
 )
 from px4fuse.results.model import LIBRARIES, Provenance
-from px4fuse.verification.model import Mismatch, PageStatus, Verification, VerificationStatus
-from px4fuse.verification.pages import TextComparison, compare_pages
+
+from .model import Mismatch, PageStatus, Verification, VerificationStatus
+from .pages import TextComparison, compare_pages
 
 ASK_AUTHOR_REMEDY = (
     "Ask the author how the report was made, and for its log and all other input files."

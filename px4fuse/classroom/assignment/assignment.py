@@ -8,21 +8,6 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from px4fuse.classroom.assignment.figures import draw_figures, make_choice_questions
-from px4fuse.classroom.assignment.key import (
-    AnswerKey,
-    CorrectAnswers,
-    compute_form_answers,
-    format_answer_key,
-    read_answer_key,
-)
-from px4fuse.classroom.assignment.random_assignment import (
-    FlightKind,
-    assign_random_flight,
-    derive_hmac_key,
-    draw_uniform,
-)
-from px4fuse.classroom.assignment.roster import Person, normalise_text
 from px4fuse.core.input_files import protect_inputs
 from px4fuse.core.text import to_json_types
 from px4fuse.core.writing import write_output_files
@@ -30,6 +15,22 @@ from px4fuse.errors import OutputError
 from px4fuse.results.answer_form import form_name, format_answer_form
 from px4fuse.simulation import flights
 from px4fuse.simulation.faults import parse_faults
+
+from .figures import draw_figures, make_choice_questions
+from .key import (
+    AnswerKey,
+    CorrectAnswers,
+    compute_form_answers,
+    format_answer_key,
+    read_answer_key,
+)
+from .random_assignment import (
+    FlightKind,
+    assign_random_flight,
+    derive_hmac_key,
+    draw_uniform,
+)
+from .roster import Person, normalise_text
 
 
 def simulate_assigned_flight(

@@ -5,8 +5,6 @@ from io import BytesIO
 
 import pandas as pd
 
-from px4fuse.classroom.assignment.key import compare_simulation
-from px4fuse.classroom.assignment.random_assignment import draw_scenario_numbers
 from px4fuse.comparison.comparison import compute_position_errors
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, Comparison, FilterName
 from px4fuse.core.record import Record, read_toml
@@ -16,6 +14,9 @@ from px4fuse.results.answer_form import CHOICE_LETTERS, Choice, ChoiceLetter
 from px4fuse.simulation import flights
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import make_scenario
+
+from .key import compare_simulation
+from .random_assignment import draw_scenario_numbers
 
 FIGURE_COUNT = 3
 # Number of straight passes along the path in each simulated flight

@@ -8,7 +8,6 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from px4fuse.classroom.assignment.roster import MAX_STUDENTS, ClassList, Person, normalise_text
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import estimate_noises_and_time_offset
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
@@ -39,6 +38,8 @@ from px4fuse.results.answer_form import (
 from px4fuse.simulation import flights
 from px4fuse.simulation.faults import FAULT_TYPES, injected_fault_names
 from px4fuse.simulation.sensors import TIMESYNC_CONVERGENCE_TIME_S
+
+from .roster import MAX_STUDENTS, ClassList, Person, normalise_text
 
 # Maximum relative error of the size of a fault in a student's answer
 FAULT_SIZE_TOLERANCE_FRACTION = 0.15

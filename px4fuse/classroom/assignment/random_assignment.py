@@ -14,10 +14,11 @@ from functools import partial
 from itertools import accumulate
 from typing import Any, Literal
 
-from px4fuse.classroom.assignment.roster import normalise_text
 from px4fuse.core.record import Record, read_csv, read_toml
 from px4fuse.errors import SettingsError
 from px4fuse.simulation.scenario import Scenario, ScenarioKind, make_scenario
+
+from .roster import normalise_text
 
 # Kind of the simulated flights: along an aisle, around a loop, or one of both at random
 FlightKind = Literal["aisle", "loop", "mixed"]

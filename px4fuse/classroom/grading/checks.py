@@ -11,8 +11,6 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta
 
-from px4fuse.classroom.assignment.key import AnswerKey, CorrectAnswers
-from px4fuse.classroom.grading.form_points import FormPoints, compute_form_points
 from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.core.record import Record, Share
 from px4fuse.core.text import capitalise_first_letter, format_factor, format_metres, shorten_to_line
@@ -29,6 +27,9 @@ from px4fuse.results.contract import (
 )
 from px4fuse.verification.model import Verification
 from px4fuse.verification.verification import flatten, is_number, log_sha256
+
+from ..assignment.key import AnswerKey, CorrectAnswers
+from .form_points import FormPoints, compute_form_points
 
 MAX_QUOTE_LENGTH = 160
 FORM_MISMATCH_REASON = "your answer form and your report are about different logs"

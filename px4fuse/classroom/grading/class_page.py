@@ -8,8 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from px4fuse.classroom.assignment.roster import format_cell_number
-from px4fuse.classroom.grading.model import (
+from px4fuse.core.text import format_count
+from px4fuse.html import frame
+from px4fuse.html.frame import Cell, Column, Row, RowDetailsSection
+from px4fuse.html.safe import load_template, make_relative_url
+from px4fuse.results.answer_form import form_rows
+
+from ..assignment.roster import format_cell_number
+from .model import (
     TOTAL_TITLE,
     Grade,
     GradedReport,
@@ -17,11 +23,6 @@ from px4fuse.classroom.grading.model import (
     list_item_titles,
     select_counted_reports,
 )
-from px4fuse.core.text import format_count
-from px4fuse.html import frame
-from px4fuse.html.frame import Cell, Column, Row, RowDetailsSection
-from px4fuse.html.safe import load_template, make_relative_url
-from px4fuse.results.answer_form import form_rows
 
 NO_SUBMISSION_STATUS = "no submission"
 # CSS style and symbol of each verification status, in sort order

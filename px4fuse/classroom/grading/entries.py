@@ -15,8 +15,11 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
-from px4fuse.classroom.assignment.key import AnswerKey
-from px4fuse.classroom.assignment.roster import (
+from px4fuse.core.text import clean_text, shorten_to_line
+from px4fuse.errors import SettingsError
+
+from ..assignment.key import AnswerKey
+from ..assignment.roster import (
     ClassList,
     Person,
     Sheet,
@@ -26,7 +29,7 @@ from px4fuse.classroom.assignment.roster import (
     read_csv_sheet,
     read_people,
 )
-from px4fuse.classroom.grading.model import (
+from .model import (
     TOTAL_TITLE,
     ExportOrigin,
     Grade,
@@ -36,9 +39,7 @@ from px4fuse.classroom.grading.model import (
     Submission,
     select_counted_reports,
 )
-from px4fuse.classroom.grading.rubric import Rubric, flag_equal_contents
-from px4fuse.core.text import clean_text, shorten_to_line
-from px4fuse.errors import SettingsError
+from .rubric import Rubric, flag_equal_contents
 
 TIME_FORMAT = "%Y-%m-%d %H:%M"
 # Table of the instructor's points and comments, which px4fuse never overwrites

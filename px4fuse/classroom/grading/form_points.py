@@ -10,8 +10,6 @@ from itertools import zip_longest
 from operator import itemgetter
 from typing import NamedTuple
 
-from px4fuse.classroom.assignment.key import CorrectFormAnswers, InjectedFault
-from px4fuse.classroom.grading.model import ItemScore
 from px4fuse.core.record import Record, read_csv, read_toml
 from px4fuse.results.answer_form import (
     CHOICE_LETTERS,
@@ -24,6 +22,9 @@ from px4fuse.results.answer_form import (
     NumericAnswer,
     select_questions,
 )
+
+from ..assignment.key import CorrectFormAnswers, InjectedFault
+from .model import ItemScore
 
 # Fraction of the points for questions about the flight; the rest is for questions about plots
 POINTS_FRACTION_OF_FLIGHT_QUESTIONS = 0.2

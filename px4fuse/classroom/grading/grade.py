@@ -10,18 +10,6 @@ from pathlib import Path
 import msgspec
 from msgspec import structs
 
-from px4fuse.classroom.assignment.key import AnswerKey
-from px4fuse.classroom.grading import submissions
-from px4fuse.classroom.grading.entries import OVERRIDES_NAME, Course, build_grades, read_overrides
-from px4fuse.classroom.grading.model import Grade, GradedReport, Submission
-from px4fuse.classroom.grading.outputs import (
-    DIAGNOSIS_SUFFIX,
-    RECORDS_FOLDER,
-    REDRAWN_REPORT_SUFFIX,
-    find_grade_column,
-    write_grading_files,
-)
-from px4fuse.classroom.grading.rubric import Rubric, grade_unreadable_file, score_report
 from px4fuse.core.reading import hash_files, max_log_bytes
 from px4fuse.core.text import shorten_to_line
 from px4fuse.core.workers import JobFailure, run_with_limits
@@ -34,6 +22,19 @@ from px4fuse.results.reading import read_results
 from px4fuse.verification.model import Verification
 from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import log_sha256, recompute_report, verify
+
+from ..assignment.key import AnswerKey
+from . import submissions
+from .entries import OVERRIDES_NAME, Course, build_grades, read_overrides
+from .model import Grade, GradedReport, Submission
+from .outputs import (
+    DIAGNOSIS_SUFFIX,
+    RECORDS_FOLDER,
+    REDRAWN_REPORT_SUFFIX,
+    find_grade_column,
+    write_grading_files,
+)
+from .rubric import Rubric, grade_unreadable_file, score_report
 
 HARMFUL_FILE_REMEDY = (
     "Do not open the file: it may be harmful. Ask the student for the PDF that px4fuse wrote."

@@ -5,9 +5,10 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 
-from px4fuse.classroom.assignment.roster import Person
 from px4fuse.results.answer_form import Answers
 from px4fuse.verification.model import Verification
+
+from ..assignment.roster import Person
 
 # Name of the sum of all points, in overrides.csv and messages
 TOTAL_TITLE = "total"

@@ -3,15 +3,16 @@
 import textwrap
 from collections.abc import Iterator, Sequence
 
-from px4fuse.classroom.assignment.key import AnswerKey, CorrectFormAnswers
-from px4fuse.classroom.grading.form_points import (
+from px4fuse.core.text import shorten_to_line
+from px4fuse.results.answer_form import FAULT_KINDS, NO_FAULT_KIND, REPORT_PANELS, Answers
+
+from ..assignment.key import AnswerKey, CorrectFormAnswers
+from .form_points import (
     describe_right_answer,
     find_panels_showing_fault,
     list_answered_choices,
 )
-from px4fuse.classroom.grading.model import Grade
-from px4fuse.core.text import shorten_to_line
-from px4fuse.results.answer_form import FAULT_KINDS, NO_FAULT_KIND, REPORT_PANELS, Answers
+from .model import Grade
 
 # Question to the student, and expected answer
 QuestionAndAnswer = tuple[str, str]

@@ -18,7 +18,13 @@ from importlib import metadata
 from operator import attrgetter
 from pathlib import Path
 
-from px4fuse.classroom.assignment.roster import (
+from px4fuse.core.input_files import protect_inputs
+from px4fuse.core.text import clean_text, join_first_names, neutralise_formulas, shorten_to_line
+from px4fuse.core.writing import write_output_files
+from px4fuse.errors import SettingsError
+from px4fuse.verification.model import Verification
+
+from ..assignment.roster import (
     ClassList,
     Sheet,
     format_cell_number,
@@ -29,22 +35,17 @@ from px4fuse.classroom.assignment.roster import (
     read_csv_sheet,
     read_student,
 )
-from px4fuse.classroom.grading.checks import shorten_text
-from px4fuse.classroom.grading.class_page import format_class_page
-from px4fuse.classroom.grading.entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
-from px4fuse.classroom.grading.model import (
+from .checks import shorten_text
+from .class_page import format_class_page
+from .entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
+from .model import (
     TOTAL_TITLE,
     Grade,
     GradedReport,
     list_item_titles,
     select_counted_reports,
 )
-from px4fuse.classroom.grading.oral_check import format_questions
-from px4fuse.core.input_files import protect_inputs
-from px4fuse.core.text import clean_text, join_first_names, neutralise_formulas, shorten_to_line
-from px4fuse.core.writing import write_output_files
-from px4fuse.errors import SettingsError
-from px4fuse.verification.model import Verification
+from .oral_check import format_questions
 
 # Subfolder of the output folder for the cached results
 RECORDS_FOLDER = "records"

@@ -19,18 +19,6 @@ from typing import TYPE_CHECKING, Annotated, Literal, Union
 import msgspec
 from msgspec import Meta
 
-from px4fuse.classroom.assignment.key import AnswerKey
-from px4fuse.classroom.assignment.roster import make_unique, normalise_text
-from px4fuse.classroom.grading.checks import (
-    FORM_MISMATCH_REASON,
-    OneLineText,
-    RubricItem,
-    ScoringInput,
-    format_reason,
-    shorten_text,
-)
-from px4fuse.classroom.grading.form_points import FormPoints
-from px4fuse.classroom.grading.model import TOTAL_TITLE, GradedReport, ItemScore
 from px4fuse.core.reading import read_text
 from px4fuse.core.record import Record
 from px4fuse.core.text import capitalise_first_letter, join_first_names, shorten_to_line
@@ -40,6 +28,19 @@ from px4fuse.results.answer_form import Answers, NumericAnswer
 from px4fuse.results.contract import LoopResults, ReportedResults
 from px4fuse.verification.model import Verification
 from px4fuse.verification.verification import log_sha256, make_unverifiable_result
+
+from ..assignment.key import AnswerKey
+from ..assignment.roster import make_unique, normalise_text
+from .checks import (
+    FORM_MISMATCH_REASON,
+    OneLineText,
+    RubricItem,
+    ScoringInput,
+    format_reason,
+    shorten_text,
+)
+from .form_points import FormPoints
+from .model import TOTAL_TITLE, GradedReport, ItemScore
 
 DEFAULT_RUBRIC = Path(__file__).with_name("rubric.toml")
 MAX_RUBRIC_BYTES = 1_000_000

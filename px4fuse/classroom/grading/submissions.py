@@ -33,8 +33,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO
 
-from px4fuse.classroom.assignment.roster import Person, make_unique
-from px4fuse.classroom.grading.model import UNKNOWN_EXPORT_ORIGIN, ExportOrigin, Submission
 from px4fuse.core.input_files import register_input_path
 from px4fuse.core.reading import list_files_recursively
 from px4fuse.core.record import read_toml
@@ -42,6 +40,9 @@ from px4fuse.core.text import clean_text, join_first_names, shorten_to_line
 from px4fuse.errors import ResultsError, SettingsError
 from px4fuse.verification.model import BAD_VALUE_ERRORS
 from px4fuse.verification.pdf_input import MAX_PDF_BYTES
+
+from ..assignment.roster import Person, make_unique
+from .model import UNKNOWN_EXPORT_ORIGIN, ExportOrigin, Submission
 
 MAX_ZIP_ENTRIES = 10_000
 # Maximum size (bytes) of the central directory of a zip file; zipfile reads it into memory

@@ -6,7 +6,8 @@ from scipy.special import chdtrc
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.core.record import Count, NonNegativeFloat, Record, Share
 from px4fuse.errors import TrajectoryError
-from px4fuse.trajectory.graph import lie, model
+
+from . import lie, model
 
 # Probability that the gate rejects a true closure
 GATE_ALPHA = 0.001

@@ -12,7 +12,8 @@ from numpy.polynomial.polynomial import polyval
 from scipy.spatial.transform import Rotation
 
 from px4fuse.core.arrays import Array
-from px4fuse.trajectory.rotation import build_matrix, skew
+
+from ..rotation import build_matrix, skew
 
 # Below this angle (rad), power series replace quotients, which lose precision
 SMALL_ANGLE_RAD = 0.3

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from px4fuse.core.arrays import Array, BoolArray, IntArray
 from px4fuse.core.record import one_line_repr
 from px4fuse.errors import TrajectoryError
-from px4fuse.trajectory.graph import lie
-from px4fuse.trajectory.graph.normal_equations import NormalEquations
+
+from . import lie
+from .normal_equations import NormalEquations
 
 # Directions with smaller eigenvalues of the information matrix (unit diagonal) are not measured
 MIN_EIGENVALUE_OF_OBSERVED_DIRECTION = 1e-9

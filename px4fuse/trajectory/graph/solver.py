@@ -11,9 +11,10 @@ from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.core.record import NOT_IN_JSON, Count, NonNegativeFloat, NotInJson, Record
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
-from px4fuse.trajectory.graph import lie, model
-from px4fuse.trajectory.graph.covariance import GateResult, gate_edges
-from px4fuse.trajectory.graph.model import PoseGraph, Residuals
+
+from . import lie, model
+from .covariance import GateResult, gate_edges
+from .model import PoseGraph, Residuals
 
 # Maximum number of closures for robust optimisation by default: more closures take minutes
 MAX_GNC_CLOSURES = 1000
