@@ -177,7 +177,7 @@ def test_mcp_prompt_has_the_log_in_a_separate_message(tmp_path: Path, serve: Any
 
     async def talk(client: Client) -> None:
         prompts = (await client.list_prompts()).prompts
-        titles = ["Diagnose this flight", "Tune EKF2 for this source", "Prepare my lab report"]
+        titles = ["Diagnose this flight", "Tune EKF2 for this source"]
         assert [prompt.title for prompt in prompts] == titles
         for prompt in prompts:
             assert [argument.name for argument in prompt.arguments or []] == ["log"]

@@ -97,7 +97,7 @@ def test_terminal_summary_wraps_without_cutting_text(document, monkeypatch) -> N
     assert sorted(summaries[WIDTH].split()) == sorted(whole.split())
     assert "\x1b" not in whole
     # the card comes first, also in a pipe; below it a paragraph is one line there
-    first = [text for line in format_card_lines(card) for text in line.wrap(card_text.CARD_WIDTH)]
+    first = [text for line in format_card_lines(card) for text in line.wrap(len(whole))]
     assert whole.splitlines()[: len(first) + 1] == [*first, ""]
     assert max(map(len, whole.splitlines()[len(first) :])) > card_text.CARD_WIDTH
 

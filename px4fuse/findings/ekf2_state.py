@@ -11,7 +11,7 @@ from px4fuse.comparison.flight_events import find_airborne_spans
 from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.core.text import format_metres
 from px4fuse.filter.signals import Segment, cut_to_segment
-from px4fuse.flight.ekf2_parameters import MAG
+from px4fuse.flight.ekf2_parameters import BAROMETER, MAG
 from px4fuse.flight.model import (
     BODY_AXES,
     Columns,
@@ -141,6 +141,11 @@ def _detect_bias_at_limit(
                     " EKF2's height RMSE against ground truth is "
                     f"{format_metres(truth.position_rmse_m)} m."
                 )
+        if axis_index == 2 and (barometer_log := ekf2.aids.get(BAROMETER.name)) is not None:
+            innovations = cut_to_segment(barometer_log.samples, analysis.segment)[
+                f"innovation_{barometer_log.axes[0]}"
+            ]
+            message += f" Barometer innovations have a mean of {abs(innovations.mean()):.1f} m."
         yield make_error(
             "ekf2_bias_at_limit",
             message,

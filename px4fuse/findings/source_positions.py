@@ -25,6 +25,7 @@ from px4fuse.finding import Finding
 from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import (
     Columns,
+    Ekf2,
     PositionTrack,
     Truth,
     Unavailable,
@@ -93,6 +94,8 @@ MAX_MEDIAN_SHIFT_DEVIATION_FRACTION = 0.5
 MAX_JUMP_TO_MEDIAN_INTERVAL_RATIO = 1.5
 # Positions alternate if at least this fraction of the jumps reverses the previous jump
 MIN_OPPOSITE_JUMP_FRACTION = 0.7
+# Maximum time (s) from a position jump to the reset of EKF2 that the jump causes
+MAX_JUMP_TO_RESET_TIME_S = 5.0
 # Maximum number of jumps whose times the finding states
 MAX_LISTED_JUMPS = 8
 # Maximum rounding difference (s) between the timestamps of a position and of its reset_counter
@@ -291,6 +294,22 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
     else:
         counter_sentence = "The source does not change reset_counter at the jumps."
         cause_sentence = find_source_texts(analysis).jump_causes
+    ekf2 = analysis.flight.ekf2
+    reset_times_s = [
+        reset.time_s for reset in (ekf2.find_horizontal_resets() if isinstance(ekf2, Ekf2) else ())
+    ]
+    reset_delays_s = [
+        reset_s - at_s
+        for at_s in times_s
+        for reset_s in reset_times_s
+        if 0.0 < reset_s - at_s < MAX_JUMP_TO_RESET_TIME_S
+    ]
+    reset_sentence = ""
+    if reset_delays_s:
+        reset_sentence = (
+            " EKF2 rejects the positions after a jump and resets its position "
+            f"{np.median(reset_delays_s):.1f} s later."
+        )
     action = "Improve the tracking of the source, or let it correct its drift in smaller steps."
     # Most jumps go back: the source alternates between two positions
     if is_reversal.mean() >= MIN_OPPOSITE_JUMP_FRACTION:
@@ -303,7 +322,7 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
         "source_relocalises",
         f"The source jumps {len(times_s)} times, by up to {jump_sizes_m.max():.2f} m. Times: "
         f"{jump_times_text} s, about every {np.median(np.diff(times_s)):.0f} s. "
-        f"{counter_sentence} {cause_sentence}",
+        f"{counter_sentence} {cause_sentence}{reset_sentence}",
         f"{action} Analyse the time between two jumps (--start, --end).",
         {
             "count": len(times_s),

@@ -299,8 +299,11 @@ def _select_map_tracks(analysis: Analysis) -> dict[str, Array]:
         return flight_samples[["north_m", "east_m"]].to_numpy().T
 
     tracks = {"positions": cut_to_flight(analysis.source.samples)}
-    if len(results) == 2:
-        tracks["KF"] = np.array([result.kf_run.steps["position_m"] for result in results])
+    for name, label in FILTER_NAMES.items():
+        runs = [result.tracks[name].run for result in results]
+        positions_m = [run.steps["position_m"] for run in runs if run]
+        if len(positions_m) == 2:
+            tracks[label] = np.array(positions_m)
     if isinstance(flight.ekf2, Ekf2):
         tracks["EKF2"] = cut_to_flight(flight.ekf2.state)
     if isinstance(flight.truth, Truth):

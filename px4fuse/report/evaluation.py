@@ -139,6 +139,11 @@ def _write_evaluation(page: Page, evaluation: Evaluation) -> None:
     _write_warnings(page, evaluation)
     head = "error", "RMSE", "mean (m)", "median (m)", "std (m)", "max (m)", "n", "rotation RMSE (°)"
     page.add_table(head, _make_error_rows(evaluation), right_aligned_columns=range(2, len(head)))
+    _write_notes(page, evaluation)
+
+
+def _write_notes(page: Page, evaluation: Evaluation) -> None:
+    """Write the reasons for missing errors, and the notes of the evaluation."""
     ate, rpe_translations = evaluation.ate, (error.translation_m for error in evaluation.rpe)
     missing_reasons = [
         f"No {quantity.what}: {quantity.reason}."
@@ -162,6 +167,7 @@ def make_evaluation_page(evaluation: Evaluation) -> Page:
         f"ATE: position RMSE after alignment ({evaluation.alignment}). RPE: RMSE of the change of "
         "position."
     )
+    _write_notes(page, evaluation)
     return page
 
 
