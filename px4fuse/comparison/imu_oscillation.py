@@ -71,7 +71,8 @@ def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | Non
     count = len(rotation_to_vehicle_axes) // 2
     # The signals are complex: an oscillation along one axis has equal powers at positive and at
     # negative frequency. Add both
-    # Rows: source, IMU, and their difference. [:, -1] is the negative frequency of [:, 1]
+    # Rows of the spectra: source, IMU, and their difference. Column -n is the negative frequency of
+    # column n
     powers = np.abs(spectra[:, 1:count]) ** 2 + np.abs(spectra[:, :-count:-1]) ** 2
     source_power, imu_power, error_power = (np.convolve(row, np.ones(3), "same") for row in powers)
     frequencies_hz = np.arange(1, count) / (len(rotation_to_vehicle_axes) * interval_s)

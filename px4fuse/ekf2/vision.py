@@ -61,7 +61,7 @@ def _group_vision_by_event(
         & (step_index < len(time_s))
         & (earliest_fusion_times_s < measurement_times_s + MAX_DELAY_BEHIND_HORIZON_S)
     )
-    # NaN: vision is disabled
+    # Positions are NaN while external vision was disabled in flight
     is_usable &= np.isfinite(vision_positions.position_m[:, 0])
     # EKF2 fuses only the newer of two samples in one prediction step
     is_usable[:-1] &= step_index[1:] > step_index[:-1]

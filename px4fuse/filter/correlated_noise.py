@@ -89,7 +89,8 @@ class SourceLowPass:
     lag_s : float
         Lag of the positions at constant velocity.
     gain_nats : float
-        Log likelihood (nats) with the low-pass filter minus log likelihood with white noise.
+        Log likelihood (nats) of the innovations with the low-pass filter, minus their log
+        likelihood with white noise only.
     sigma_z_m : float
         White position noise before the low-pass filter (1 σ).
     """

@@ -29,7 +29,7 @@ class PredictionSteps:
     last_steps : ndarray of int, shape (m,)
         Index of the time of each measurement. An interval between measurements ends there.
     interval_index : ndarray of int, shape (n - 1,)
-        Index of the interval that contains each step.
+        Index of the interval between measurements that contains each prediction step.
     acceleration_m_s2 : ndarray, shape (n - 1,)
         Mean acceleration over each step.
     imu_gap_variance_m2_s4 : ndarray, shape (n - 1,)

@@ -54,7 +54,12 @@ def detect_lost_data(flight: Flight) -> Findings:
         if log.bytes and lost_bytes:
             lost_percent_text = format_number(100.0 * lost_bytes / log.bytes, 2)
             damage_text += f": px4fuse cannot read {lost_percent_text} % of its bytes"
-        message = " ".join(f"{_capitalise_note(note)}." for note in (damage_text, *log.damage))
+        # A file name at the start of a note keeps its case
+        notes = (
+            note if "." in note.split(" ", 1)[0] else capitalise_first_letter(note)
+            for note in (damage_text, *log.damage)
+        )
+        message = f"{'. '.join(notes)}."
         action = "Copy the log again. If this does not help, replace the SD card."
         if log.format.startswith("MAVLink"):
             action = "Record on a link without loss: by cable, or on the companion computer."
@@ -130,10 +135,6 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
             "consistency of EKF2 cannot be tested.",
             action,
         )
-
-
-def _capitalise_note(note: str) -> str:
-    return note if "." in note.split(" ", 1)[0] else capitalise_first_letter(note)
 
 
 def detect_unavailable_data(analysis: Analysis) -> Findings:

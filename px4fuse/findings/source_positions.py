@@ -295,17 +295,13 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
         counter_sentence = "The source does not change reset_counter at the jumps."
         cause_sentence = find_source_texts(analysis).jump_causes
     ekf2 = analysis.flight.ekf2
-    reset_times_s = [
-        reset.time_s for reset in (ekf2.find_horizontal_resets() if isinstance(ekf2, Ekf2) else ())
-    ]
-    reset_delays_s = [
-        reset_s - at_s
+    resets = ekf2.find_horizontal_resets() if isinstance(ekf2, Ekf2) else ()
+    delays_s = (
+        min((reset.time_s - at_s for reset in resets if reset.time_s > at_s), default=np.inf)
         for at_s in times_s
-        for reset_s in reset_times_s
-        if 0.0 < reset_s - at_s < MAX_JUMP_TO_RESET_TIME_S
-    ]
+    )
     reset_sentence = ""
-    if reset_delays_s:
+    if reset_delays_s := [delay for delay in delays_s if delay < MAX_JUMP_TO_RESET_TIME_S]:
         reset_sentence = (
             " EKF2 rejects the positions after a jump and resets its position "
             f"{np.median(reset_delays_s):.1f} s later."

@@ -116,7 +116,7 @@ def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[Mavl
         or [(system, AUTOPILOT_COMPONENT_ID) for system, _ in frame_counts]
     )
     if system_id is not None:
-        # If the user gives the id, the heartbeat is sufficient
+        # A system id from the user also selects a vehicle that sends only heartbeats
         candidates = [
             address for address in (*vehicle_addresses, *candidates) if address[0] == system_id
         ]

@@ -305,7 +305,8 @@ def _find_body_table(
         unit = dict(zip(rows[0][::2], rows[0][1::2], strict=False)).get("Length Units", "")
         values_by_title = {header.loc[1, row]: header[row] for row in range(2, axes_row)}
         body_names = values_by_title.get("Name", axes)
-        # All bodies are possible if the line Type is missing, or contains no rigid body
+        # If the header line Type is missing or names no rigid body, the user can choose any column
+        # group as the tracked body
         is_rigid_body = values_by_title.get("Type", axes) == "Rigid Body"
         # Rotations are not read, because the axes of a rigid body are not FRD
         is_position = header[axes_row - 1] == "Position"

@@ -330,8 +330,9 @@ def _describe_innovations(result: AxisComparison) -> str:
             f"{consistency.innovation_mean_m:+.3f} m, standard deviation "
             f"{consistency.innovation_std_m:.3f} m, median √S {consistency.sqrt_s_median_m:.3f} m."
         )
-    sentences.append("Triangles: values outside the plot. Hollow dots: rejected positions.")
-    return " ".join(sentences)
+    return " ".join(
+        [*sentences, "Triangles: values outside the plot. Hollow dots: rejected positions."]
+    )
 
 
 def _format_fraction_outside_two_sigma(result: AxisComparison) -> str:

@@ -337,7 +337,8 @@ def is_same_name(name: str, other_name: str) -> bool:
     )
     if sorted(words) == sorted(other_words):
         return bool(words)
-    # one name may be joined, and begin with any of the words: "lovelaceada"
+    # one of the names may be a single word, in which the words of the other name are joined in any
+    # cyclic order: "lovelaceada" for "Ada Lovelace"
     shorter_name_words, longer_name_words = sorted((words, other_words), key=len)
     rotations = (
         "".join(longer_name_words[start:] + longer_name_words[:start])

@@ -192,8 +192,8 @@ def _solve_gnc(
     can_be_false_closure: BoolArray,
 ) -> tuple[_Optimum, Array]:
     """Reject false closures by graduated non-convexity; return the optimum and the edge weights."""
-    # Quantiles of χ²: an edge with a smaller χ² keeps full weight, and a dropped edge adds a
-    # constant cost. Other edges than closures are never dropped
+    # Both limits are quantiles of the χ² distribution. A closure with χ² below chi2_bound keeps the
+    # weight 1. A dropped closure adds cost_if_dropped to the cost. Odometry edges are never dropped
     half_degrees_of_freedom = model.count_observed_directions(graph.information) / 2.0
     chi2_bound = np.where(
         can_be_false_closure & (half_degrees_of_freedom > 0.0),
