@@ -558,7 +558,7 @@ def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCau
         rms_m = rerun.after.difference_rms_m
         if rerun.filter == corrected_filter and rms_m is not None:
             label = {"kf": "KF", "ekf2": "EKF2 (replay)"}[corrected_filter]
-            return f"{difference_text}; {format_metres(rms_m)} m after correcting {label}."
+            return f"{difference_text}; {format_metres(rms_m)} m in the re-run of {label}."
     return f"{difference_text}."
 
 

@@ -300,7 +300,7 @@ def _format_cause_lines(cause: DiagnosedCause, do_this: str) -> Iterator[Paragra
     label_width = max(map(len, labels), default=0) + 2
     for label, (_, action) in zip(labels, actions, strict=True):
         yield from _format_action_lines(label, label_width, action)
-    yield from _format_rerun_table(cause.reruns)
+    yield from _format_rerun_lines(cause.reruns)
     yield Paragraph(cause.after, "  ", "  ")
 
 
@@ -329,12 +329,12 @@ def _format_action_lines(label: str, label_width: int, action: Action) -> Iterat
         label_text = indent
 
 
-def _format_rerun_table(reruns: Sequence[CardRerun]) -> Iterator[Paragraph]:
-    rows = make_rerun_rows(reruns)
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
-        yield Paragraph(f"  {'  '.join(cells)}".rstrip())
+def _format_rerun_lines(reruns: Sequence[CardRerun]) -> Iterator[Paragraph]:
+    headings, *rows = make_rerun_rows(reruns) or [[]]
+    for label, *values, result in rows:
+        named_values = zip(headings[1:], values, strict=False)  # the last heading is that of result
+        text = ", ".join(f"{heading} {value}" for heading, value in named_values if value)
+        yield _make_labelled_paragraph("re-run", f"{label}: {text}; {result}")
     yield Paragraph(format_rerun_note(reruns), "  ", "  ")
 
 
@@ -366,8 +366,8 @@ def format_rerun_note(reruns: Sequence[CardRerun]) -> str:
     if not replay_starts_s:
         return ""
     return (
-        "EKF2 (replay): prediction by px4fuse's model of EKF2, without gaps and the first "
-        f"{min(replay_starts_s):.0f} s."
+        "EKF2 (replay): predictions by px4fuse's model of EKF2. They exclude gaps in the positions "
+        f"and the first {min(replay_starts_s):.0f} s."
     )
 
 

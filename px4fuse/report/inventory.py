@@ -19,7 +19,7 @@ def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
     page.write(inventory.flight.log.name, bold=True)
     page.write_labelled_texts(dict(_describe_log(inventory)))
     for option in inventory.abilities:
-        label = "Possible" if option.possible else "Not possible"
+        label = "Possible analysis" if option.possible else "Not possible"
         colour = GOOD_COLOUR if option.possible else SEVERITY_COLOURS["warning"]
         page.write(f"{label}: {option.name} ({option.reason})", colour=colour)
     if inventory.abilities[0].possible:  # comparison of KF and EKF2
