@@ -50,9 +50,11 @@ MIN_CONCORDANCE_CORRELATION_WITHOUT_WARNING = {EKF2_REFERENCE: 0.9, IMU_REFERENC
 MAX_TIME_OFFSET_SIGMA_S = 0.5
 # The best frame is unambiguous if the residual in the second best frame is larger by this factor
 MIN_SECOND_TO_BEST_FRAME_RESIDUAL_RATIO = 1.3
-# Minimum residual with the given yaw ÷ residual with the estimated yaw, to report a wrong yaw
+# Test of a yaw from the user: minimum ratio of the horizontal RMS residual (file to reference
+# track) with this yaw to the residual with the estimated yaw, to report that the yaw is wrong
 MIN_RESIDUAL_RATIO_OF_GIVEN_TO_ESTIMATED_YAW = 2.0
-# Minimum residual (m, RMS) with the given yaw, to report a wrong yaw
+# Test of a yaw from the user: minimum horizontal RMS residual (m) from file to EKF2's position with
+# this yaw, to report that the yaw is wrong
 MIN_RESIDUAL_OF_MISALIGNED_FRAME_M = 0.3
 
 
@@ -151,11 +153,13 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> TrackMatch | None:
             _require_unique_match(match)
             return _refit_without_origin_resets(flight, match, problem)
         except NoMatchError as error:
-            # All parameters are from the user. The IMU is not accurate enough to check them
+            # The user gave all alignment parameters, so the match only checks them. The IMU is not
+            # accurate enough for such a check
             if not missing_options:
                 return None
-            # With a remedy, the file matches this reference but one parameter is ambiguous. The IMU
-            # determines the parameters less accurately than EKF2's position
+            # If the error has a remedy, the file matches this reference track, but one alignment
+            # parameter is ambiguous. The IMU determines the parameters less accurately than EKF2's
+            # position, so it is not tried
             if error.remedy:
                 raise
             reasons.append(error.reason)
@@ -286,7 +290,7 @@ def _refit_without_origin_resets(
         ekf2_track,
         is_lag_estimated=problem.lag_s is None,
     )
-    # Each fit starts at the lag of its predecessor
+    # Each fit to the new track starts at the lag of the previous fit to the track with resets
     fit = fit_with_estimated_yaw = refit(match.fit_with_estimated_yaw, yaw_rad=None)
     if problem.yaw_rad is not None:
         fit = refit(match.fit, yaw_rad=problem.yaw_rad)
@@ -307,7 +311,8 @@ def _fit_file_in_frame(
                 f"the position file is shorter than {MIN_OVERLAP_S:g} s, too short for a "
                 "match with the IMU"
             )
-        # make_imu_references filters twice: velocity and position. Filter the file equally
+        # make_imu_references applies the band-pass filter twice: to velocity and to position. Apply
+        # it twice to the positions of the file, too
         position_m = apply_band_pass(apply_band_pass(grid_track.position_m))
         file_track = grid_track = mark_transients(replace(grid_track, position_m=position_m))
     if problem.lag_s is None:

@@ -64,14 +64,15 @@ def _explain_mismatch(
 ) -> tuple[str, str] | None:
     """Return error message and advice if the IMU shows wrong axes or a wrong unit of the file."""
     samples = problem.samples
-    # The log can begin or end at any time of the file, so offsets up to the longer span are tested
+    # Position file and log may overlap only partly, so time offsets up to the longer of the two
+    # durations are tested
     span_s = max(samples.index[-1] - samples.index[0], flight.log.duration_s)
     if span_s > MAX_CONVENTION_CHECK_SPAN_S:
         return None
     time_s = samples.index - samples.index[0] + (problem.lag_s or 0.0)
     positions = samples[["x_m", "y_m", "z_m"]].to_numpy() / metres_per_unit
     position_samples = pd.DataFrame(positions, time_index(time_s.to_numpy()), Columns.POSITION)
-    # The check uses only the positions of this track
+    # determine_source_convention uses only the positions of a track; the other fields are empty
     track = PositionTrack("", POSITION_FILE_ORIGIN, "", position_samples, "unknown", "", ())
     max_time_offset_s = span_s if problem.lag_s is None else MAX_TIME_OFFSET_S
     convention = determine_source_convention(flight, track, max_time_offset_s)
@@ -86,7 +87,8 @@ def _explain_mismatch(
             describe_wrong_unit(convention.unit, "the positions", stated_unit, is_file=True)
         )
     stated_frame = problem.frames[0].upper() if len(problem.frames) == 1 else ""
-    # The axes are multiples of 90°: with another rotation, they do not contradict the stated frame
+    # convention.axes are the axes of the file, rounded to multiples of 90°. If the file's frame has
+    # an additional rotation, rounded axes do not contradict the frame that the user stated
     is_rotated = abs(convention.rotation_deg) > MIN_FRAME_ROTATION_DEG
     if stated_frame and convention.axes != FRAME_AXES[stated_frame] and not is_rotated:
         faults.append(
@@ -109,7 +111,8 @@ MIN_RESIDUAL_RATIO_WITHOUT_WARNING = {EKF2_REFERENCE: 2.0, IMU_REFERENCE: 1.4}
 MAX_UNIX_CLOCK_DIFFERENCE_S = 60.0
 # Minimum yaw (°) for a message about a misaligned frame
 MIN_REPORTED_YAW_DEG = 1.0
-# Minimum distance (m) between the origins for a message about a misaligned frame
+# Minimum distance (m) between the origins of the file's frame and of EKF2's frame, for a message
+# about a misaligned frame
 MIN_REPORTED_SHIFT_M = 1.0
 
 
@@ -153,7 +156,7 @@ def align_position_file(
         f"clock, the position file from {start_s:.2f} s to {end_s:.2f} s on a "
         f"{recording.clock_kind} clock"
     )
-    # Flight time of the first position of the file
+    # Time (s) from the start of the log to the first position of the file
     lag_s = None if clock_offset_s is None else start_s + clock_offset_s - boot_time_s
     if lag_s is not None and not start_s - end_s <= lag_s <= duration_s:
         raise MissingDataError(
@@ -196,7 +199,7 @@ def align_position_file(
     offset_method = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
     invalid_reasons, sample_count = recording.reason_by_invalid_row, len(recording.samples)
-    # A clock map, which reports repeated timestamps, already counts the dropped rows
+    # If most timestamps are repeated, the number of dropped rows is stated in clock_map
     clock_map = describe_repeated_timestamps(
         recording.clock_kind, sample_count + recording.dropped_row_count, sample_count
     )
@@ -268,7 +271,7 @@ def _apply_alignment(
     if match and is_yaw_estimated:
         yaw_rad = match.fit.yaw_rad
         yaw_sigma_deg = float(np.degrees(match.fit.yaw_sigma_rad or 0.0))
-        if reference_name == EKF2_REFERENCE:  # the IMU does not determine the origin
+        if reference_name == EKF2_REFERENCE:  # the IMU cannot determine the frame's origin
             origin_m = match.fit.origin_m
     time_offset_reason = "the offset was given with --clock-offset"
     if match and clock_offset_s is None:
@@ -285,7 +288,8 @@ def _apply_alignment(
         )
     aligned_samples = align_samples(problem.samples, frame, yaw_rad, origin_m, lag_s)
     distance_to_ekf2_m = None
-    # EKF2 did not match a file that was matched with the IMU
+    # A file was matched with the IMU only because it does not match EKF2's position: do not compare
+    # it with EKF2's position
     if reference_name != IMU_REFERENCE and (
         ekf2_comparison := _compare_with_ekf2(flight, aligned_samples)
     ):

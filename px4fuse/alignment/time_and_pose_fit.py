@@ -21,15 +21,18 @@ from .tracks import (
 
 # Maximum change (s) of the lag from the correlation peak to the least-squares fit
 MAX_LAG_CORRECTION_S = 1.0
-# Minimum concordance correlation coefficient (Lin 1989) of an accepted match
+# Minimum concordance correlation coefficient (Lin 1989) of position file and reference track, to
+# accept their match
 MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH = {EKF2_REFERENCE: 0.7, IMU_REFERENCE: 0.5}
-# Lower limit of 1 - c in the match quality -N·ln(1 - c) of N samples with concordance c. Without
-# this limit, a lag with a few samples at equal positions would be the best match
+# Lower limit of 1 - c in the match quality -N·ln(1 - c) of N common samples with concordance
+# correlation coefficient c. Without this limit, a lag at which a few samples agree exactly would be
+# the best match
 MIN_CONCORDANCE_DEFICIT = 1e-4
 # Lags within this time (s) of the best lag may belong to the same correlation peak
 MIN_PEAK_DISTANCE_S = 3.0
-# A second peak needs at least this fraction of the common samples, and of the sum of squared
-# positions, at the best lag: a match of few samples, or of samples at rest, is no evidence
+# Second peak of the correlation over the lag: minimum number of common samples, and minimum sum of
+# squared positions, as fractions of the values at the best lag. A match of few samples, or of
+# samples at rest, is no evidence
 MIN_SECOND_PEAK_SAMPLE_FRACTION, MIN_SECOND_PEAK_SQUARE_SUM_FRACTION = 0.5, 0.25
 # Error (m) of the interpolation of positions to the time grid
 INTERPOLATION_ERROR_M = 0.05
@@ -113,7 +116,8 @@ def find_correlation_peak(
     common_sample_counts, covariance = moments_by_lag.count, moments_by_lag.covariance
     square_sum_m2 = moments_by_lag.sum_of_squares_a + moments_by_lag.sum_of_squares_b
     has_overlap = common_sample_counts >= min_sample_count
-    # If the vehicle is at rest in both tracks, the sum of squares is only a rounding error
+    # If the vehicle is at rest in both tracks, the sum of squared positions (relative to their
+    # mean) is only a rounding error
     has_overlap &= square_sum_m2 > 1e-9 * np.max(square_sum_m2)
     rotated_covariance = (
         np.abs(covariance) if yaw_rad is None else (np.exp(-1j * yaw_rad) * covariance).real
@@ -131,7 +135,7 @@ def find_correlation_peak(
         float(reference.time_s[0]) + (best_index - len(file_track.is_valid) + 1) * GRID_STEP_S,
         concordance_correlation[best_index],
     )
-    # The best peak ends where the concordance falls below half of its maximum
+    # The best peak ends where the concordance correlation falls below half of its maximum
     steps_from_best = np.arange(len(covariance)) - best_index
     region_numbers, _ = label(
         (np.abs(steps_from_best) <= round(MIN_PEAK_DISTANCE_S / GRID_STEP_S))

@@ -81,7 +81,7 @@ class SampledTrack:
 
     def at(self, time_s: Array) -> tuple[Array, BoolArray]:
         """Interpolate the position at given times; the mask is True between two valid samples."""
-        # 1, except for rounding errors, if both samples are valid
+        # The interpolated validity is 1 (except for rounding errors) only between two valid samples
         is_valid = np.interp(time_s, self.time_s, self.is_valid.astype(float), 0.0, 0.0) > 0.999
         return interpolate_columns(time_s, self.time_s, self.position_m), is_valid
 

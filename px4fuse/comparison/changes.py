@@ -126,7 +126,7 @@ def find_main_axis_changes(
 
     The report shows their effect also if the filter is consistent.
     """
-    # Changes for the mean NIS are first
+    # Changes that may correct the mean NIS are before those that may correct the mean NEES
     changes = remove_repeated_changes(
         change
         for statistic in CONSISTENCY_STATISTICS[::-1]
@@ -135,11 +135,12 @@ def find_main_axis_changes(
         )
     )
     if ekf2_inputs is not None:
-        # Correct timestamps have another effect than the delay parameter, which has limits
+        # The delay parameter has limits, so its effect can differ from that of corrected
+        # timestamps: test both
         if any(ekf2_inputs.aid.delay in change for change in changes):
             changes += _find_offset_changes(estimates, ekf2_inputs)
         return remove_repeated_changes(changes)
-    # For KF, also test both noises together, and the default settings
+    # For KF, also test SIGMA_A and SIGMA_Z together, and their default values
     noise_changes = [change for change in changes if change.keys() <= KF_NOISE_SETTINGS]
     if len(noise_changes) > 1:
         changes.append({name: value for change in noise_changes for name, value in change.items()})
@@ -216,8 +217,9 @@ def _find_kf_noise_changes(
         (SIGMA_Z_KEY, axis_tuning.sigma_z),
     ):
         setting = getattr(settings, name)
-        # A setting is too large above the 95 % interval, and too small below it. Without an
-        # estimate, a setting that is too large is reduced to the upper limit of the interval
+        # A setting is too large if it is above the 95 % interval of its estimate, and too small if
+        # it is below. If only the upper limit of the interval is known, a setting that is too large
+        # is reduced to it
         if is_underconfident:
             estimate = noise.value_or_bound(0.0)
             is_significant = noise.high is not None and setting > noise.high

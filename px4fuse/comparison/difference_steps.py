@@ -33,7 +33,8 @@ MAX_RELATIVE_RMSE_DIFFERENCE = 0.05
 MIN_CONTRIBUTION_FRACTION = 0.05
 # The user's SIGMA_A or SIGMA_Z is wrong if it differs from its estimate by this factor or more
 MIN_SETTING_TO_ESTIMATE_RATIO = 4.0
-# A property of EKF2 is not reported if its use in KF changes KF's position by less (m)
+# KF is run with one property of EKF2 after the other (for example EKF2's delay or innovation gate).
+# A property is reported only if it changes KF's position by more than this value (m)
 MIN_REPORTED_KF_POSITION_CHANGE_M = 1e-6
 # A position difference KF - EKF2 outside the replayed time is reported only above this value (m)
 MIN_DIFFERENCE_OUTSIDE_REPLAY_M = 0.5
@@ -323,8 +324,9 @@ def _describe_rmse(explanation: DifferenceExplanation) -> list[str]:
             f"{100 * MAX_RELATIVE_RMSE_DIFFERENCE:.0f} %): KF {kf_rmse_m:.3f} m, EKF2 "
             f"{ekf2_rmse_m:.3f} m."
         ]
-    # The properties are replaced one after the other: each replacement starts at the RMSE of the
-    # previous one. Find the largest change of the mean square in the direction from KF to EKF2
+    # KF's properties are replaced by those of EKF2 one after the other: element i is KF's RMSE
+    # after i replacements. Find the replacement that changes KF's mean square error most towards
+    # that of EKF2
     rmses_m = [
         kf_rmse_m,
         *(replacement.position_rmse_to_truth_m or 0.0 for replacement in explanation.steps),

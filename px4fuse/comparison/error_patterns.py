@@ -1,7 +1,7 @@
 """Patterns in the errors of a position source: jitter, noise that increases with speed, and others.
 
 White noise is the deviation from a cubic polynomial through four neighbouring positions. Slow
-errors are found only with ground truth.
+(time-correlated) errors are found only with ground truth.
 """
 
 from typing import NamedTuple
@@ -40,16 +40,19 @@ VELOCITY_HALF_WINDOW_S = 0.3
 RESIDUAL_CORRELATION_LENGTH = 3
 # Minimum reported timestamp jitter (s, 1 σ): a position error of 8 mm at 1 m/s
 MIN_JITTER_S = 0.008
-# Limits of the ratio of measured position residuals to residuals expected from jitter, which are
-# timestamp residual · velocity
+# Detection of timestamp jitter: a timestamp error causes a position residual of -timestamp error ·
+# velocity. The ratio of measured to expected position residuals must be between these limits
 RESIDUAL_TO_JITTER_ERROR_RATIO_LIMITS = 0.6, 1.5
-# Minimum RMS of the position residuals due to jitter ÷ RMS of all position residuals
+# Detection of timestamp jitter: minimum RMS of the position residuals that the jitter causes ÷ RMS
+# of all position residuals
 MIN_JITTER_FRACTION_OF_RESIDUAL = 0.4
-# Jitter, and noise that increases with speed, are reported only above this multiple of their σ
+# Timestamp jitter, and position noise that increases with speed, are reported only above this
+# multiple of their σ
 MIN_SIGNIFICANCE_SIGMAS = 6.0
-# Number of flight parts in which the correlation of noise with speed is tested
+# Number of flight parts in which the correlation of position noise with speed is tested
 FLIGHT_PART_COUNT = 5
-# Minimum correlation of noise and speed ÷ σ of the correlation (median over the flight parts)
+# Minimum correlation of position noise and speed ÷ σ of the correlation (median over the flight
+# parts)
 MIN_NOISE_SPEED_CORRELATION_SIGMAS = 1.2
 # Slow flight is below the first of these quantiles of the speed, fast flight above the second
 SLOW_SPEED_QUANTILE, FAST_SPEED_QUANTILE = 0.3, 0.7
@@ -64,40 +67,43 @@ FLIGHT_PART_DURATION_FOR_OFFSET_S = 4.0
 MIN_SPEED_FOR_OFFSET_M_S = 0.3
 # Minimum reported variation (s) of the time offset: a position error of 8 cm at 1 m/s
 MIN_OFFSET_RANGE_S = 0.08
-# Minimum mean square of the slow errors ÷ variance of the white noise: smaller slow errors may be
-# noise
+# Minimum mean square of the slow (time-correlated) position errors ÷ variance of the white position
+# noise: smaller slow errors may be noise
 MIN_SLOW_TO_WHITE_NOISE_RATIO = 0.25
-# A varying time offset is reported only if its removal reduces the mean square of the slow errors
-# to this fraction or less
+# A time offset that varies in flight is reported only if its removal reduces the mean square of the
+# slow position errors to this fraction or less
 MAX_REMAINING_SLOW_ERROR_FRACTION = 0.2
-# A sinusoidal error is reported only if it explains at least this fraction of the mean square of
-# the slow errors
+# A sinusoidal position error is reported only if it explains at least this fraction of the mean
+# square of the slow position errors
 MIN_PERIODIC_ERROR_FRACTION = 0.88
-# Minimum amplitude of a reported sinusoidal error ÷ σ of the white noise
+# Minimum amplitude of a reported sinusoidal position error ÷ σ of the white position noise
 MIN_AMPLITUDE_TO_WHITE_NOISE_RATIO = 1.0
 MIN_PERIOD_COUNT = 5.0
-# Maximum tested frequency (Hz) of a sinusoidal error
+# Maximum tested frequency (Hz) of a sinusoidal position error
 MAX_FREQUENCY_HZ = 2.0
 FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT = 0.2
 MIN_BINS_PER_PERIOD = 30
 # Maximum fraction of the mean square of the vehicle's motion at the frequency of the sinusoidal
 # error: with more motion at this frequency, the motion may cause the error
 MAX_FRACTION_OF_MOTION_AT_ERROR_FREQUENCY = 0.1
-# Sampling interval (s) of the compared rotations
+# Delay of the logged attitude: vehicle rotations from the attitude are compared with rotations
+# integrated from the gyroscopes. Interval (s) between the starts of successive rotations
 ROTATION_INTERVAL_S = 0.01
 # Maximum tested delay (s) of the logged attitude
 MAX_ATTITUDE_DELAY_S = 0.5
 # Minimum reported delay (s) of the logged attitude
 MIN_ATTITUDE_DELAY_S = 0.04
 MAX_ROTATION_COUNT = 20_000
-# Duration (s) of each compared rotation
+# Duration (s) of each rotation
 ROTATION_COMPARISON_TIME_S = 0.1
-# Rotation differences (rad) are limited to this value, because attitude resets cause larger ones
+# Differences (rad) between attitude and gyroscope rotations are limited to this value, because
+# attitude resets cause larger ones
 MAX_ROTATION_DIFFERENCE_RAD = 0.2
 # A delay of the logged attitude is reported only if its removal reduces the mean square rotation
 # difference between attitude and gyroscopes to less than this fraction
 MAX_ROTATION_DIFFERENCE_RATIO_WITHOUT_DELAY = 0.5
-# In fast flight, minimum speed (m/s) and noise (m) to report noise that increases with speed
+# Minimum speed (m/s) and position noise (m) in fast flight, to report noise that increases with
+# speed
 MIN_HIGH_SPEED_M_S, MIN_NOISE_AT_HIGH_SPEED_M = 0.3, 0.02
 # σ of normal noise ÷ median of its absolute values
 SIGMA_PER_MEDIAN_ABSOLUTE_VALUE = 1.4826
@@ -229,9 +235,11 @@ def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
     is_same = np.eye(len(NEIGHBOUR_ROW_OFFSETS), dtype=bool)
     numerators[:, is_same] = denominators[:, is_same] = 1.0
     weights = np.prod(numerators / denominators, axis=2)
-    # σ of position - Σ weight · neighbour, for equal σ of all positions
+    # σ of a residual (position minus weighted sum of its neighbours) ÷ σ of a position, if all
+    # positions have the same σ
     residual_to_position_sigma_ratio = np.sqrt(1.0 + np.sum(weights**2, axis=1))
-    # Timestamps minus equal intervals; the running median contains drift and gaps, but no jitter
+    # Timestamps minus times at equal intervals. The running median follows drift and gaps, but not
+    # jitter
     timestamp_deviation_s = time_s - interval_s * np.arange(len(time_s))
     padded_deviation_s = np.pad(
         timestamp_deviation_s, TIMESTAMP_MEDIAN_FILTER_LENGTH // 2, mode="edge"
@@ -279,13 +287,15 @@ def find_timestamp_jitter(errors: LocalResiduals) -> float | None:
     jitter_s = float(np.std(errors.timestamp_jitter_s))
     if jitter_s < MIN_JITTER_S or not expected_square_sum_m2:
         return None
-    # Linear regression, without a constant, of the residuals on those expected from the jitter
+    # Linear regression (without a constant) of the measured position residuals on the residuals
+    # expected from the timestamp jitter
     residual_ratio = float(np.sum(errors.residual_m * expected_residual_m)) / expected_square_sum_m2
     unexplained_residual_m = errors.residual_m - residual_ratio * expected_residual_m
     residual_ratio_sigma = np.sqrt(
         RESIDUAL_CORRELATION_LENGTH * np.mean(unexplained_residual_m**2) / expected_square_sum_m2
     )
-    # The ratio must be near 1 and significant, and jitter must cause much of the position noise
+    # Measured and expected residuals agree if their ratio is near 1 and significantly above 0. The
+    # jitter must also cause much of the position noise
     jitter_fraction = np.sqrt(expected_square_sum_m2 / np.sum(errors.residual_m**2))
     is_jitter = (
         RESIDUAL_TO_JITTER_ERROR_RATIO_LIMITS[0]
@@ -325,8 +335,8 @@ def find_speed_dependent_noise(errors: LocalResiduals) -> SpeedDependentNoise | 
     cross_track_residual_m = np.abs(
         np.sum(errors.residual_m * _rotate_clockwise_90_deg(direction), axis=1)
     )
-    # If the noise increases only along the track, jitter may be the cause: report only noise that
-    # increases along and across the track
+    # If the position noise increases only along the track, timestamp jitter may be the cause:
+    # report only noise that increases along and across the track
     if any(
         np.median(noise_m[is_fast]) < MIN_FAST_TO_SLOW_NOISE_RATIO * np.median(noise_m[is_slow])
         for noise_m in (along_track_residual_m, cross_track_residual_m)
@@ -378,8 +388,8 @@ def fit_errors_against_truth(
     scale_error_sigma = np.sqrt(
         np.mean(residual_m**2) / (path_mean_square_m2 * independent_error_count)
     )
-    # The slow errors of odometry are its residuals without drift. The running mean of the constant
-    # offsets is zero, so their columns are omitted
+    # For odometry, drift is removed from the errors by subtraction of their running mean. It also
+    # removes constant offsets, so the two offset columns are omitted
     if comparison.source.origin.may_drift:
         from scipy.ndimage import uniform_filter1d  # noqa: PLC0415 - slow import
 
@@ -468,9 +478,9 @@ def find_time_offset_variation(fit: ErrorFit) -> TimeOffsetVariation | None:
     moving_part_indices = np.flatnonzero(mean_square_speeds > MIN_SPEED_FOR_OFFSET_M_S**2)
     if len(moving_part_indices) < 2:
         return None
-    # Fit one time offset per flight part together with parameters that are constant in flight. To
-    # solve this fit in two steps, first remove the best time offsets of the flight parts from the
-    # errors and from the Jacobian columns, then fit the constant parameters
+    # Fit one time offset per flight part together with offset, scale factor and rotation, which are
+    # constant in flight. To solve this fit in two steps, first remove the best time offsets of the
+    # flight parts from the errors and from the Jacobian columns, then fit the constant parameters
     error_per_time_offset_m_s = -fit.velocity_m_s
     inverse_square_speed_sums = np.zeros_like(square_speed_sums)
     inverse_square_speed_sums[moving_part_indices] = 1.0 / square_speed_sums[moving_part_indices]
@@ -484,14 +494,15 @@ def find_time_offset_variation(fit: ErrorFit) -> TimeOffsetVariation | None:
         )
         return velocity_weighted_sums * inverse_square_speed_sums[:, None]
 
-    # Columns of the constant parameters. Last column: the errors to be fitted by the other columns
+    # Jacobian columns of offset, scale factor and rotation. The last column contains the position
+    # errors to which they are fitted
     columns = np.concatenate([fit.columns[..., :-1], fit.residual_m[..., None]], axis=-1)
     time_offsets_by_column_s = fit_time_offsets_by_part(columns)
     columns -= (
         error_per_time_offset_m_s[:, :, None] * time_offsets_by_column_s[flight_part_indices, None]
     )
     parameters, residual_m = _fit_least_squares(columns[..., :-1], columns[..., -1])
-    # Time offsets of the errors that the constant parameters do not explain
+    # Time offset of each flight part, without the effect of offset, scale factor and rotation
     offsets_s = (time_offsets_by_column_s @ np.append(-parameters, 1.0))[moving_part_indices]
     slow_error_mean_square_m2 = fit.compute_slow_error_mean_square_m2()
     unexplained_mean_square_m2 = (
@@ -534,9 +545,9 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
     )
     angle_rad = integrate_cumulatively(imu[Columns.ANGULAR_RATE].to_numpy(), imu_time_s)
 
-    # The tested delays are multiples of the sampling interval. The gyro rotations begin one maximum
-    # delay earlier than those of the attitude: row i of the attitude, without delay, is row
-    # i + max_delay_in_rows of the gyros
+    # Each tested delay of the attitude is a multiple of ROTATION_INTERVAL_S. The gyroscope
+    # rotations start MAX_ATTITUDE_DELAY_S before the attitude rotations. Without a delay, row i of
+    # the attitude therefore corresponds to row i + max_delay_in_rows of the gyroscopes
     max_delay_in_rows = round(MAX_ATTITUDE_DELAY_S / ROTATION_INTERVAL_S)
     gyro_time_s = time_s[0] + ROTATION_INTERVAL_S * np.arange(
         -max_delay_in_rows, len(time_s) + max_delay_in_rows
@@ -549,9 +560,10 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
         rotation_differences_rad = (
             rotation_rad - gyro_rotation_rad[first_row : first_row + len(rotation_rad)]
         )
-        # Remove the median difference, which is due to the gyroscope bias
+        # Remove the median difference between attitude and gyroscope rotations, which is due to the
+        # gyroscope bias
         rotation_differences_rad -= np.median(rotation_differences_rad, axis=0)
-        # Limit the effect of attitude resets
+        # An attitude reset causes a large difference: limit its effect on the mean square
         limited_angles_rad = np.minimum(
             np.linalg.norm(rotation_differences_rad, axis=1), MAX_ROTATION_DIFFERENCE_RAD
         )

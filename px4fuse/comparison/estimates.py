@@ -360,7 +360,8 @@ def widen_for_scatter(time_offset: SourceTimeOffset, cause: str) -> SourceTimeOf
     """
     offsets_s = np.array([part.offset_s for part in time_offset.parts])
     weights = np.array([part.sigma_s**-2.0 for part in time_offset.parts])
-    # Too few parts to estimate the scatter. Drift and change cannot be distinguished from scatter
+    # With too few flight parts, the scatter of their time offsets is unknown. A drift or change of
+    # the time offset cannot be distinguished from scatter
     if len(offsets_s) <= MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE:
         return structs.replace(
             time_offset, change_p_value=None, drift_ppm=None, drift_sigma_ppm=None

@@ -17,11 +17,15 @@ MIN_OSCILLATION_FREQUENCY_HZ, MAX_OSCILLATION_FREQUENCY_HZ, MAX_FREQUENCY_TO_RAT
     5.0,
     0.45,
 )
-# The power of a peak at frequency f is compared with the median power from f ÷ ratio to f · ratio
+# Spectrum of the acceleration error (second differences of positions minus those of the doubly
+# integrated acceleration): the power of a peak at frequency f is compared with the median power
+# from f ÷ ratio to f · ratio
 BAND_LIMIT_RATIO = 1.33
-# Minimum power of a peak ÷ median power: in flights without an oscillation, the ratio is below 6
+# Minimum power of a peak of the acceleration error ÷ median power. In flights without an
+# oscillation, this ratio is below 6
 MIN_PEAK_TO_MEDIAN_POWER_RATIO = 8.0
-# Maximum power of a peak in the positions ÷ power in the accelerations: a real motion is in both
+# At the frequency of the peak, maximum power in the positions ÷ power in the measured acceleration:
+# both contain a real motion
 MAX_SOURCE_TO_IMU_POWER_RATIO = 0.25
 MIN_AMPLITUDE_M_S2 = 0.3
 
@@ -64,15 +68,14 @@ def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | Non
     rotation_to_vehicle_axes = np.exp(
         -1j * np.interp(time_s[1:-1], attitude.index.to_numpy(), headings_rad)
     )
-    # A second difference ÷ interval² is an acceleration
+    # Second differences are proportional to the acceleration (factor: interval²)
     window = np.hanning(len(rotation_to_vehicle_axes))
     second_differences_m = np.diff(positions_m, 2, axis=1) * rotation_to_vehicle_axes * window
     spectra = np.fft.fft([*second_differences_m, np.diff(second_differences_m, axis=0)[0]])
     count = len(rotation_to_vehicle_axes) // 2
-    # The signals are complex: an oscillation along one axis has equal powers at positive and at
-    # negative frequency. Add both
-    # Rows of the spectra: source, IMU, and their difference. Column -n is the negative frequency of
-    # column n
+    # The signals are complex, so an oscillation along one axis has equal powers at positive and
+    # negative frequency: add both. Rows of the spectra: source, IMU, and their difference. Column
+    # -n is the negative frequency of column n
     powers = np.abs(spectra[:, 1:count]) ** 2 + np.abs(spectra[:, :-count:-1]) ** 2
     source_power, imu_power, error_power = (np.convolve(row, np.ones(3), "same") for row in powers)
     frequencies_hz = np.arange(1, count) / (len(rotation_to_vehicle_axes) * interval_s)
@@ -98,11 +101,12 @@ def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | Non
     peak_index = int(np.argmax(error_power[peaks] / medians))
     peak = peaks[peak_index]
     frequency_hz = float(frequencies_hz[peak])
-    # The Hann window spreads an oscillation over 3 bins with 1.5 times the power of the middle bin.
-    # Both signs of the frequency together: imu_power is 3 times the power of the middle bin
+    # The Hann window spreads an oscillation over 3 bins with a total power of 1.5 times that of the
+    # middle bin. imu_power adds positive and negative frequency: 3 times the power of the middle
+    # bin
     amplitude_m = 2.0 * np.sqrt(imu_power[peak] / 3.0) / window.sum()
-    # Derivative ÷ difference of a sinusoid of this frequency; its square is the ratio for second
-    # differences
+    # Amplitude of the derivative of a sinusoid ÷ amplitude of its difference over interval_s. The
+    # square is the same ratio for second derivative and second difference
     acceleration_per_difference = np.pi * frequency_hz / np.sin(np.pi * frequency_hz * interval_s)
     oscillation = ImuOscillation(frequency_hz, float(amplitude_m * acceleration_per_difference**2))
     is_oscillating = (

@@ -117,8 +117,8 @@ def find_noisy_flight_part(
     part_medians = np.array(
         [np.median(scaled_innovations[:, first:end]) for first, end in pairwise(part_edges)]
     )
-    # The limit is in the middle between the extreme medians on a logarithmic scale, so it separates
-    # two levels of noise
+    # A flight part is noisy if its median innovation is above the geometric mean of the smallest
+    # and the largest median of all parts: this limit separates two levels of noise
     noisy_parts = np.flatnonzero(part_medians > np.sqrt(part_medians.min() * part_medians.max()))
     # The noisy parts must be one continuous time span, but not the whole flight
     if len(noisy_parts) in (0, part_count) or np.ptp(noisy_parts) >= len(noisy_parts):

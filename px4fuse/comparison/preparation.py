@@ -87,8 +87,8 @@ def prepare_comparison_inputs(
     flight, source, settings, convention = _correct_convention(
         flight, source, settings, is_checked=not (keep_positions_as_sent or flight.log.is_assessed)
     )
-    # The order is important: lever arm and origin need positions in NED with correct timestamps,
-    # and the axes need the final heights
+    # The order is important: lever arm and EKF2's origin are subtracted from positions in NED with
+    # correct timestamps. make_axes needs the final heights
     source = _subtract_lever_arm(source, flight)
     source = _shift_vision_to_ekf2_origin(source, flight)
     source = _use_barometer_height(source, flight, request.height)
@@ -159,8 +159,9 @@ def select_source_innovations(flight: Flight, track: PositionTrack) -> Flight:
     ekf2 = replace_vision_by_gnss_innovations(
         flight.ekf2, GNSS if track.barometer is None else GNSS_WITH_BAROMETER_HEIGHT
     )
-    # GNSS innovations replace those of vision, so missing vision innovations are not reported. Nor
-    # are missing position sources (entries with a source), because GNSS is the position source
+    # GNSS innovations replace vision innovations, so missing vision innovations are not reported.
+    # Missing position sources (entries with the field source) are not reported either, because GNSS
+    # is the position source
     missing_vision_innovations, missing_gnss_innovations = (
         [item for item in each.innovations.values() if isinstance(item, Unavailable)]
         for each in (flight.ekf2, ekf2)
@@ -304,7 +305,8 @@ def explain_missing_source(flight: Flight) -> Unavailable:
             f"use {track.name}, which EKF2 did not fuse (--position-source {track.name}), "
             f"or {remedy}"
         )
-    # Heights without positions replace the general reason. GNSS without a fix is an additional one
+    # If a source contains only heights, this specific reason replaces the general reason. The
+    # reason that GNSS has no fix is added
     reason = f"no external position in this log (possible sources: {topics})"
     for item in flight.missing:
         if item.reason == HEIGHT_ONLY_REASON:

@@ -25,7 +25,8 @@ from px4fuse.flight.model import (
 # Minimum measurement noise √R (m) that EKF2 uses (ev_pos_control.cpp, EKF2.cpp)
 EKF2_MIN_NOISE_M = 0.01
 MIN_COMMON_SAMPLES = 3
-# NED columns of each projected quantity, and exponent of the direction cosines (2 for variances)
+# NED columns of each quantity that is projected onto an axis, and exponent of the direction cosines
+# (2 for variances)
 PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
     "position_m": (Columns.POSITION, 1),
     "velocity_m_s": (Columns.VELOCITY, 1),
@@ -244,7 +245,8 @@ def _combine_north_and_east(
         cosine * north["innovation_m"] + sine * east["innovation_m"]
     )
     for column in ("test_ratio", "fused", "rejected"):
-        # EKF2 fuses or rejects both axes together, so the larger value is used
+        # EKF2 fuses or rejects north and east together: use the larger test ratio or flag of both
+        # axes
         combined_innovations[column] = np.fmax(north[column], east[column])
     return combined_innovations
 

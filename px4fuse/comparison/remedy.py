@@ -31,9 +31,9 @@ GNSS_DELAYS_MS = (0.0, 150.0, 300.0)
 TRANSMISSION_DELAY_MS = 30.0
 # EKF2_DELAY_MAX is rounded up to a multiple of this value (ms)
 EKF2_DELAY_MAX_STEP_MS = 50.0
-# Minimum fraction of the time with fused heights, to report a different height noise
+# Advice on the height noise of vision: minimum fraction of the time in which EKF2 fused heights
 MIN_FUSED_FRACTION_OF_HEIGHTS = 0.5
-# Minimum reported ratio of height noise to horizontal noise
+# Advice on the height noise of vision: minimum ratio of estimated height noise to horizontal noise
 MIN_HEIGHT_TO_HORIZONTAL_NOISE_RATIO = 2.0
 
 
@@ -76,8 +76,8 @@ def estimate_gnss_delay_ms(
             for axis in ("north", "east")
             for updates in update_tables
         ]
-        # NIS sum over velocity and position: the mean, times the equal number of samples in all
-        # replays
+        # NIS sum over position and velocity along both axes. To compare replays, the mean NIS is
+        # multiplied by the same number of samples in all replays
         nis_sums.append(float(np.mean(nis)) * len(nis) * len(received_positions.timestamp_s))
     # NIS sum = -2 ln p = (delay - estimate)² / σ² + constant
     quadratic_coefficient, linear_coefficient, _ = np.polyfit(GNSS_DELAYS_MS, nis_sums, 2)
@@ -115,7 +115,8 @@ def estimate_ekf2_parameters(
     if not is_source_fused(comparison, inputs):
         return {}
     axis_tuning = find_first_available_tuning(tuning, HORIZONTAL, AISLE_AXIS, "north", "east")
-    # With GNSS, a noise of vision below that of GNSS has no effect
+    # If EKF2 also fuses GNSS, a change of the vision noise has no effect if old and new value are
+    # below the GNSS noise
     used_noise_m = find_used_noise_m(inputs)
     min_noise_m = used_noise_m if origin.may_drift or origin.is_gnss else 0.0
     if (
@@ -197,7 +198,7 @@ def find_delay_max_change(
     comparison: PreparedComparison, position_age_ms: float
 ) -> dict[str, float]:
     """Return a larger EKF2_DELAY_MAX than logged if it is required for this age (ms)."""
-    # log.parameters contain only the parameters of the results, without EKF2_DELAY_MAX
+    # log.parameters contain only PARAMETERS_IN_RESULTS, so EKF2_DELAY_MAX is missing
     ekf2 = comparison.flight.ekf2
     parameters = {} if isinstance(ekf2, Unavailable) else ekf2.parameters
     return make_delay_max_change(parameters, position_age_ms)

@@ -24,31 +24,32 @@ Improvement = Literal["position and σ", "position", "σ only", "nothing"]
 # A position error is reported only if the mean NEES is at least this value. Without a fault, the
 # mean NEES is below 3
 MIN_REPORTED_NEES = 4.0
-# A smaller noise setting makes a filter overconfident if it increases a mean NEES above 1 to this
-# value or more
+# A re-run with a smaller noise setting makes a filter overconfident if it increases a mean NEES
+# above 1 to this value or more
 MIN_OVERCONFIDENT_NEES_AFTER_CHANGE = 2.0
-# A change is a possible cause of a wrong σ if its re-run removes 50 % to 150 % of ln(mean NIS) or
-# ln(mean NEES). A removal of 100 % makes the filter consistent
+# A re-run with a changed setting or corrected data removes a fraction of ln(mean NIS) or ln(mean
+# NEES): 1 - value after ÷ value before. With a fraction of 1, the filter is consistent. The change
+# is a possible cause of a wrong σ if the fraction differs from 1 by at most this value
 POSSIBLE_CAUSE_EXPLAINED_FRACTION_TOLERANCE = 0.5
-# A sensor fault is the only cause of a wrong σ if its correction removes 75 % to 125 % of
-# ln(mean NIS) or ln(mean NEES)
+# A sensor fault is the only cause of a wrong σ if the fraction that its correction removes differs
+# from 1 by at most this value
 ONLY_CAUSE_EXPLAINED_FRACTION_TOLERANCE = 0.25
-# A change is combined with another change if its re-run removes 10 % to 190 % of ln(mean NIS) or
-# ln(mean NEES)
+# A change is combined with another change if the fraction that its re-run removes differs from 1 by
+# less than this value
 COMBINED_CHANGE_EXPLAINED_FRACTION_TOLERANCE = 0.9
 SENSOR_CORRECTION_KEYS = frozenset((OUTLIERS_KEY, TIME_OFFSET_KEY, ROTATION_KEY, FORWARD_BIAS_KEY))
-# Changes that have an effect only together with another change
+# Settings and data corrections that have an effect only together with another change
 CHANGE_KEYS_WITHOUT_EFFECT_ALONE = frozenset(
     ("EKF2_DELAY_MAX", EV_POS.noise_mode_parameter, RIGHT_BIAS_KEY)
 )
-# A re-run has an effect if it changes a σ ratio by at least this factor
+# A re-run has an effect if it changes actual σ ÷ reported σ by at least this factor
 MIN_SIGMA_RATIO_CHANGE_FACTOR = 1.10
 # A re-run has an effect if it changes the position RMSE by more than this fraction
 MIN_RMSE_CHANGE_FRACTION = 0.05
 # A re-run improves the position if it reduces the position RMSE by at least this fraction
 MIN_RMSE_REDUCTION = 0.20
-# A re-run does not correct an overconfident filter if ln(σ ratio) after the re-run is above this
-# fraction of ln(σ ratio) before
+# A re-run does not correct an overconfident filter if ln(actual σ ÷ reported σ) after the re-run is
+# above this fraction of its value before
 MAX_REMAINING_OVERCONFIDENCE_FRACTION = 0.75
 
 
@@ -167,8 +168,8 @@ def find_cause_rerun(
             rerun.corrects_sensor
             and explained_fraction_error <= ONLY_CAUSE_EXPLAINED_FRACTION_TOLERANCE
         )
-        # The smallest tuple is the best: first sufficient re-runs, then few changes, then corrected
-        # sensor faults, then the smallest remaining inconsistency
+        # The re-run with the smallest tuple is the best. Order of importance: inconsistency
+        # corrected completely, few changes, sensor fault corrected, small remaining inconsistency
         return (
             not (is_complete or brings_inside_limits(rerun, statistic)),
             len(rerun.change.keys() - CHANGE_KEYS_WITHOUT_EFFECT_ALONE),

@@ -76,8 +76,9 @@ from .rerun_effects import (
 
 # Mean NIS above which innovations are too large for the reported σ
 MAX_NORMAL_NIS = 1.5
-# Maximum factor between unchanged replay and log, in RMSE and in actual σ ÷ reported σ. Up to this
-# factor, changed replays of EKF2 are compared with the log; otherwise with the unchanged replay
+# Reference for the re-runs of EKF2: the log, if a replay without changes agrees with it, else this
+# replay. Replay and log agree if their position RMSEs, and their ratios of actual to reported σ,
+# differ by at most this factor
 MAX_REPLAYED_TO_LOGGED_ERROR_RATIO = 1.10
 
 
@@ -264,7 +265,8 @@ def _rerun_with_changes(
         )
 
     reruns = [make_rerun(change, discrepancies) for change, discrepancies in changes]
-    # If no change alone is sufficient, combine the best change with each other helpful change
+    # If no change alone makes the filter consistent, combine the best change with each other change
+    # that makes it more consistent
     for statistic in CONSISTENCY_STATISTICS:
         helpful_reruns = find_partial_corrections(reruns, statistic)
         reruns += [
@@ -396,8 +398,9 @@ def _replay_ekf2(
     model_with_moved_positions = misalign_positions(
         model, change.get(ROTATION_KEY, 0.0), change.get(TIME_OFFSET_KEY, 0.0)
     )
-    # Convert the outlier times from KF's timestamps to those of the replay: without KF's time
-    # offset, with the tested time offset, and for GNSS with the delay that KF subtracts
+    # Convert the times of the outliers from KF's timestamps to the timestamps of the replay:
+    # subtract KF's time offset, add the delay that KF subtracts from GNSS timestamps, and add the
+    # time offset that the re-run tests
     excluded_times_s, axis_tuning = None, find_axis_tuning(tuning, HORIZONTAL)
     if OUTLIERS_KEY in change and axis_tuning is not None:
         excluded_times_s = axis_tuning.outlier_time_s - comparison.settings.clock_offset_s
@@ -423,8 +426,8 @@ def _summarise_replay(
     """
     evaluated_spans_s, axis = model.baseline_replay.find_evaluated_spans(), axis_result.axis
     if ROTATION_KEY in change and comparison.source.origin.is_gnss:
-        # The re-run rotates the GNSS positions, and with them EKF2's frame. Rotate the axis by the
-        # same angle (clockwise: a negative angle in _rotate_direction)
+        # The re-run rotates the GNSS positions, and with them EKF2's frame. Rotate the evaluated
+        # axis by the same angle (clockwise: a negative angle in _rotate_direction)
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION_KEY]))
     cosines, updates = axis.direction[:2], rows_inside(ekf2_replay.updates, evaluated_spans_s)
     innovation_variance_m2, observation_variance_m2, posterior_variance_m2 = (
