@@ -171,7 +171,8 @@ def diagnose_comparison(comparison: Comparison, progress: Progress = ignore_prog
         )
     estimates = estimate(comparison, progress)
     release_free_memory()
-    # the delay that the findings report; it does not change the re-runs
+    # Refine the delay that the findings report. The timestamps are not shifted again, so the
+    # re-runs do not change
     comparison = refine_delay(comparison, estimates.time_offset)
     reruns = rerun(comparison, estimates, progress)
     release_free_memory()
@@ -204,8 +205,8 @@ def refine_delay(comparison: Comparison, time_offset: SourceTimeOffset | Unavail
     # A late source has a positive delay and a negative time offset
     refined_convention = structs.replace(comparison.convention, late_s=-time_offset.offset_s)
     refined_comparison = replace(comparison, convention=refined_convention)
-    # A delay that is too small to be a fault is 0 in convention_faults. If one of the two delays is
-    # 0, the comparison with the first delay is kept
+    # In convention_faults, a delay that is too small to be a fault is 0. The detected delay is
+    # replaced only if detected and refined delay are both faults
     is_late_before_and_after_refinement = (
         comparison.convention_faults.late_s and refined_comparison.convention_faults.late_s
     )

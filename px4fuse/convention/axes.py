@@ -29,11 +29,13 @@ from .motion import (
 MAX_TIME_OFFSET_S = 10.0
 # Minimum time (s) with positions and IMU data, to determine axes, unit and time offset
 MIN_OVERLAP_S = 10.0
-# Minimum σ (m) of the horizontal residuals: IMU noise and tilt errors are always present
+# Residuals are second differences of the positions minus those of the doubly integrated
+# acceleration. Minimum σ (m) of the horizontal residuals: IMU noise and tilt errors are always
+# present
 MIN_HORIZONTAL_SIGMA_M = 0.05
-# Minimum σ (m) of the vertical residuals
+# Minimum σ (m) of the vertical residuals (positions minus doubly integrated acceleration)
 MIN_VERTICAL_SIGMA_M = 0.08
-# Degrees of freedom of the Student distribution of the residuals
+# Degrees of freedom of the Student distribution of horizontal and vertical residuals
 STUDENT_DEGREES_OF_FREEDOM = 4.0
 METRES_PER_UNIT: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
 # A frame that is rotated from NED by at most this angle (rad) is a misaligned NED frame
@@ -41,9 +43,9 @@ SMALL_ROTATION_RAD = np.radians(8.0)
 
 # Time offsets up to this value (s) are equally probable a priori
 SMALL_TIME_OFFSET_S = 0.3
-# Log prior odds of a frame that is rotated by more than SMALL_ROTATION_RAD
+# Log prior odds of axes that differ from multiples of 90° to north by more than SMALL_ROTATION_RAD
 LARGE_ROTATION_LOG_PRIOR_ODDS = -1.0
-# Log prior odds of a frame that is rotated by at most SMALL_ROTATION_RAD
+# Log prior odds of axes that differ from multiples of 90° to north by at most SMALL_ROTATION_RAD
 SMALL_ROTATION_LOG_PRIOR_ODDS = -0.5
 # Log prior odds of a time offset above SMALL_TIME_OFFSET_S
 LARGE_TIME_OFFSET_LOG_PRIOR_ODDS = -2.0
@@ -51,17 +53,22 @@ LARGE_TIME_OFFSET_LOG_PRIOR_ODDS = -2.0
 UNIT_OTHER_THAN_METRES_LOG_PRIOR_ODDS = -2.0
 # σ (m) of barometer heights
 BAROMETER_SIGMA_M = 0.5
-# Assumed number of independent height errors in a flight
+# Comparison of the positions with barometer heights: assumed number of independent height errors in
+# a flight
 INDEPENDENT_HEIGHT_ERROR_COUNT = 6.0
-# Larger height errors (m) count as this value, so that outliers have little effect
+# Larger differences (m) between positions and barometer heights count as this value, so that
+# outliers have little effect
 MAX_HEIGHT_ERROR_M = 20.0 * BAROMETER_SIGMA_M
 MAX_REFINED_HYPOTHESES = 8
-# Maximum log-likelihood (nats) below that of the best hypothesis, to refine a hypothesis
+# A hypothesis is a combination of axes, unit and delay of the positions. Least squares refine only
+# hypotheses whose log-likelihood is at most this value (nats) below the largest
 MAX_SCORE_DEFICIT_OF_REFINED_HYPOTHESES = 60.0
-# Maximum number of second differences in one least-squares fit, to limit the computing time
+# Maximum number of second differences of the positions in one least-squares fit, to limit the
+# computing time
 MAX_REFINEMENT_ROWS = 1200
 MAX_REFINEMENT_ITERATIONS = 7
-# The refinement stops at a smaller change of the score (nats): a parameter moves by 0.14 σ at most
+# The least-squares fit of a hypothesis stops at a smaller change of its score (nats): a parameter
+# then moves by 0.14 σ at most
 MIN_SCORE_CHANGE = 0.01
 # Maximum change (s) of the time offset in one Gauss-Newton iteration
 MAX_TIME_OFFSET_STEP_S = 0.15
@@ -279,7 +286,8 @@ def find_convention_candidates(
     if not has_overlap.any():
         return []
     delay_s = (np.flatnonzero(has_overlap) - (len(has_overlap) - 1) / 2.0) * GRID_INTERVAL_S
-    # Mean products of source axes and NED axes, mean squares of source axes and of NED axes
+    # Means over the common samples: products of source axes and IMU axes (NED), squares of source
+    # axes, squares of IMU axes
     products, source_squares, imu_squares = (
         _compute_cross_moments(source_values, imu_values)[has_overlap]
         / common_sample_counts[has_overlap]
@@ -298,7 +306,7 @@ def find_convention_candidates(
     score, rotation_rad = _compute_log_likelihoods(
         products, source_squares, imu_squares, permutations
     )
-    # Times the number of independent residuals
+    # The log-likelihood per residual is multiplied by the number of independent residuals
     score *= common_sample_counts[has_overlap] * (GRID_INTERVAL_S / SECOND_DIFFERENCE_WINDOW_S)
     nearest_quarter_turns = np.round(rotation_rad / (np.pi / 2.0)).astype(int) % 4
     hypotheses = []
@@ -317,7 +325,7 @@ def find_convention_candidates(
                 + axis_permutation.compute_log_prior_odds(quarter_turns)
                 + UNIT_OTHER_THAN_METRES_LOG_PRIOR_ODDS * (unit_name != "m")
             )
-            # No drifts, no accelerometer bias
+            # The least-squares fit starts without heading drift, clock drift and accelerometer bias
             parameters = np.array(
                 [delay_s[offset_index], rotation_rad[offset_index, permutation_index], *[0.0] * 5]
             )
@@ -369,7 +377,7 @@ def _compute_log_likelihoods(
     )
     source_squares = np.maximum(source_squares, 1e-12)
 
-    # Mean squares of source minus IMU, with the positions in metres
+    # Mean squares of the residuals (source minus IMU), with the positions converted to metres
     horizontal_mean_square_residual_m2 = (
         metres_per_unit**2
         * (source_squares[:, first_horizontal_axis] + source_squares[:, second_horizontal_axis])
@@ -597,7 +605,7 @@ def _compute_height_log_likelihood_ratio(
         * hypothesis.axis_permutation.vertical_sign
         * positions.position_m[:, hypothesis.axis_permutation.vertical_axis]
     )
-    # down + height is constant for a correct hypothesis
+    # If the hypothesis is correct, down position + barometer height is constant
     error_m = down_m - np.median(down_m) + height_m - np.median(height_m)
     mean_square_error_m2 = np.mean(np.minimum(error_m**2, MAX_HEIGHT_ERROR_M**2))
     min_variance_m2 = BAROMETER_SIGMA_M**2

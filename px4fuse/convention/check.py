@@ -43,19 +43,24 @@ from .motion import (
 from .orientation import determine_orientation_convention
 from .texts import format_axes, format_delay
 
-# For the verdict "determined", the log-likelihood (nats) of the best convention (axes, unit, delay)
-# must exceed that of the second best by this value
+# Convention of a position source: axes, unit and delay. For the verdict "determined", the
+# log-likelihood (nats) of the best convention must exceed that of the second best by this value
 MIN_CONVENTION_LOG_ODDS = 4.0
-# If the log-likelihood (nats) of the best convention exceeds that of positions unrelated to the
-# measured motion by less than this value, the convention is not determinable
+# The convention (axes, unit, delay) is not determinable if its log-likelihood (nats) exceeds that
+# of positions unrelated to the measured motion by less than this value
 MIN_LOG_LIKELIHOOD_GAIN = 8.0
-# Minimum log-likelihood gain (nats) per independent residual, if only one convention fits
+# If no other convention (axes, unit, delay) fits nearly as well, the best one is doubtful below
+# this gain in log-likelihood (nats) per independent residual, relative to positions unrelated to
+# the motion
 MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE = 0.15
-# Minimum log-likelihood gain (nats) per independent residual, if several conventions fit
+# If other conventions (axes, unit, delay) fit nearly as well, the best one is doubtful below this
+# gain in log-likelihood (nats) per independent residual
 MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE_IF_AMBIGUOUS = 0.4
-# Limits of the ratio of displacements in the positions to displacements integrated from the IMU
+# A convention (axes, unit, delay) is doubtful if the ratio of displacements in the positions to
+# displacements integrated from the IMU is outside these limits
 MIN_SOURCE_TO_IMU_DISPLACEMENT_RATIO, MAX_SOURCE_TO_IMU_DISPLACEMENT_RATIO = 0.88, 1.12
-# A convention is doubtful if σ of its residuals is above this multiple of σ of the expected noise
+# A convention (axes, unit, delay) is doubtful if σ of its residuals (positions minus IMU motion) is
+# above this multiple of σ of the expected noise
 MAX_RESIDUAL_TO_NOISE_RATIO = 2.4
 # σ (m) of the noise in second differences of the position integrated from the IMU
 IMU_SECOND_DIFFERENCE_SIGMA_M = 0.05
@@ -71,8 +76,8 @@ MAX_GNSS_RESIDUAL_RATIO = 0.1
 MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT = 15.0
 # Tested clock drifts (rate of the clock minus 1)
 TESTED_CLOCK_DRIFTS = np.linspace(-0.05, 0.05, 21)
-# A low-pass filter of the source replaces the estimated delay if it increases the log-likelihood by
-# more than this value (nats). With simulated delays, the increase is below 3
+# A low-pass filter in the source is assumed instead of a delay, if it increases the log-likelihood
+# by more than this value (nats). With simulated delays, the increase is below 3
 MIN_LOG_LIKELIHOOD_GAIN_FROM_LOW_PASS = 8.0
 # Limits (s) of delays that may be the effect of a low-pass filter
 MIN_LOW_PASS_DELAY_S, MAX_LOW_PASS_DELAY_S = 0.2, 5.0
@@ -278,7 +283,8 @@ def _choose_convention(
         rotation_deg=rotation_deg,
         late_s=best_hypothesis.delay_s,
         clock_drift=clock_drift,
-        # Noise of the source does not bias this bound of the scale
+        # The scale factor is the lower bound of the displacement ratio, because noise of the source
+        # affects only the upper bound
         scale=best_hypothesis.min_source_to_imu_displacement_ratio,
         log_odds=best_hypothesis.score - other_hypotheses[0].score if other_hypotheses else None,
         log_likelihood_gain=best_hypothesis.score,
@@ -367,13 +373,15 @@ def _estimate_clock_drift(
         positions.compute_second_differences(imu_motion),
         imu_motion,
     )
-    # determine_source_convention tests a removed drift again, with all hypotheses
+    # If a clock drift was removed before the fit, no test is made here: determine_source_convention
+    # repeats the search of the convention without the drift
     if (
         not removed_drift
         and hypothesis.score <= start_hypothesis.score + MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT
     ):
         return 0.0
-    # Combine the clock rates: 1 + removed drift, and 1 - drift that is left (_evaluate_hypothesis)
+    # Total rate of the clock: remove_clock_drift divides the times by 1 + removed_drift, and
+    # _evaluate_hypothesis multiplies them by 1 - remaining drift
     return (1.0 + removed_drift) / (1.0 - float(hypothesis.parameters[CLOCK_DRIFT])) - 1.0
 
 
@@ -411,7 +419,8 @@ def _check_orientation(
         imu_motion.time_s < time_s[-1] - SECOND_DIFFERENCE_WINDOW_S
     )
     imu_motion = replace(imu_motion, is_valid=imu_motion.is_valid & is_covered)
-    # Headings (°) of the x axis of the positions if the source's orientation has no heading error
+    # Expected heading (°) of the x axis of the positions if the heading of the source's orientation
+    # is correct: 0 in NED and NWU, 90 in ENU
     if axis_permutation.vertical_sign > 0 or convention.frames == "FLU to NWU":
         expected_x_axis_headings_deg = [0.0]
     elif convention.frames == "FLU to ENU":

@@ -25,13 +25,17 @@ from .motion import integrate_inertial_data, replace_heading
 from .orientation import convert_to_attitude
 from .texts import FRAME_AXES, OPPOSITE_DIRECTION, format_axes
 
-# Minimum rotation (°) that is corrected in addition to wrong axes
+# Minimum rotation (°) of the positions about the vertical that is corrected in addition to wrong
+# axes
 MIN_RESIDUAL_ROTATION_DEG = 8.0
-# Minimum rotation (°) that is corrected if the axes are correct
+# Minimum rotation (°) of the positions about the vertical that is corrected if, apart from it, the
+# horizontal axes are correct
 MIN_FRAME_ROTATION_DEG = 15.0
-# Minimum delay (s) that is corrected together with axes and unit
+# Minimum delay (s) of the position timestamps that is corrected together with axes and unit of the
+# positions
 MIN_DELAY_TO_CORRECT_S = 0.5
-# Minimum reported heading difference (°) between orientation and positions
+# Minimum reported heading error (°) of the source's orientation, from a comparison of its positions
+# with the motion from IMU and orientation
 MIN_HEADING_ERROR_DEG = 10.0
 # Fault of the orientation: copy of EKF2's attitude, quaternion order, frames, or heading
 OrientationFault = Literal["", "copied", "order", "frames", "heading"]
@@ -113,7 +117,8 @@ def find_convention_faults(
         and orientation_fault != "copied"
     )
     has_no_heading_reference = uses_gyro_heading and not is_fused and not has_wrong_axes
-    # With a wrong heading of the source, the orientation is the fault. FRD has no fixed rotation
+    # The positions are not rotated if the orientation has a wrong heading (it is then the fault),
+    # if no independent heading is known, or in an FRD frame, which has no fixed rotation from north
     if has_wrong_heading or is_heading_from_source or has_no_heading_reference or frame == "FRD":
         rotation_deg = 0.0
     faults = ConventionFaults(
@@ -184,7 +189,7 @@ def convert_to_px4_convention(
     if faults.orientation == "copied" and origin.kind == "vio":
         origin = structs.replace(origin, kind=infer_position_kind(samples))
     if faults.orientation in ("copied", "heading"):
-        orientation = None  # it cannot be corrected
+        orientation = None  # not a measurement, or with a wrong heading
     elif orientation is not None and convention.orientation is not None:
         quaternion = orientation[Columns.QUATERNION].to_numpy()
         orientation = orientation.set_axis(_correct_times(orientation.index, faults))

@@ -20,15 +20,17 @@ from .motion import (
 
 # Minimum lever arm (m) that is reported: twice the noise of good UWB (0.1 m)
 MIN_REPORTED_LEVER_ARM_M = 0.2
-# Minimum ratio of a reported lever arm to its σ: noise reaches 1.5
+# Minimum ratio of a reported lever arm to its σ: noise alone causes ratios up to 1.5
 MIN_LEVER_ARM_SIGMAS = 2.5
 MIN_LEVER_ARM_WITH_TRUTH_M = 0.05
 MIN_LEVER_ARM_SIGMAS_WITH_TRUTH = 5.0
 # Maximum reported lever arm (m): larger values are frame errors of the position source
 MAX_REPORTED_LEVER_ARM_M = 5.0
-# Maximum residual (σ) of a sample in the next fit
+# Samples with a residual above this multiple of σ are outliers and omitted from the next fit of the
+# lever arm
 MAX_RESIDUAL_SIGMAS = 3.0
-# Minimum ratio of singular values in the lever arm fit with ground truth
+# Minimum ratio of smallest to largest singular value in the lever arm fit with ground truth: below
+# it, not all parameters can be determined
 MIN_SINGULAR_VALUE_RATIO = 0.02
 MIN_COORDINATE_COUNT = 40
 LEVER_ARM_FIT_COUNT = 4
@@ -92,8 +94,9 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
     )
     velocity_m_s = np.gradient(true_positions_m, time_s, axis=0)
     error_per_radian_m = _rotate(true_positions_m - np.nanmean(true_positions_m, axis=0), 90.0)
-    # Columns: lever arm (forward, right), offset (north, east), delay and rotation. Delay and
-    # rotation are fitted because they resemble a lever arm
+    # Columns: derivatives of the position error with respect to lever arm (forward, right), offset
+    # (north, east), delay and rotation. Delay and rotation are also fitted, because their effects
+    # on the position resemble that of a lever arm
     attitude_columns = to_rotation_matrix(interpolate_attitude(attitude, time_s))[:, :2, :2]
     offset_columns = np.broadcast_to(np.eye(2), attitude_columns.shape)
     motion_columns = np.stack([velocity_m_s, error_per_radian_m], axis=2)
@@ -102,13 +105,14 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
     design_rows = design[is_known].reshape(-1, 6)
     if len(design_rows) < MIN_COORDINATE_COUNT:
         return None
-    # The rank test needs columns of equal size: divide the rotation column by its RMS
+    # The rank test of lstsq compares singular values, so all columns need a similar magnitude:
+    # divide the rotation column by its RMS
     column_scales = np.ones(6)
     column_scales[-1] = max(
         np.sqrt(np.nanmean(error_per_radian_m**2)), MIN_RMS_DISTANCE_FROM_PATH_MEAN_M
     )
     rotation_deg = 0.0
-    for _ in range(LEVER_ARM_FIT_COUNT):  # a large rotation is not linear: fit the rest again
+    for _ in range(LEVER_ARM_FIT_COUNT):  # a large rotation is not linear: rotate, fit again
         error_m = _rotate(position_samples.to_numpy(), -rotation_deg) - true_positions_m
         valid_position_errors_m = error_m[is_known].ravel()
         scaled_parameters, _, rank, _ = np.linalg.lstsq(
@@ -170,6 +174,7 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
         inertial_data.time_s, rotation, imu_motion.time_s
     ).second_differences.reshape(-1, 2, 2)
     horizontal_imu_m = imu_motion.table[:, :2, 0]
+    # Derivatives of the second differences of the positions with respect to the fitted parameters
     design = np.concatenate(
         [
             rotation_second_differences,  # lever arm forward, right
@@ -189,7 +194,7 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
         second_difference_error_m = source_motion.second_differences - horizontal_imu_m
         design_rows = design[is_used].reshape(-1, design.shape[2])
         valid_second_difference_errors_m = second_difference_error_m[is_used].ravel()
-        # Second differences with common positions are not independent
+        # Second differences of overlapping time windows are not independent
         independent_difference_count = (
             len(valid_second_difference_errors_m)
             * GRID_INTERVAL_S
@@ -211,10 +216,11 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
             / independent_difference_count
         )
         is_used &= residual_m < MAX_RESIDUAL_SIGMAS * sigma_m
-        # Parameter 2: time (s) by which the timestamps are early
+        # Fitted parameter 2: time (s) by which the timestamps are early
         time_s = time_s + fitted_parameters[2]
         rotation_deg += float(np.degrees(fitted_parameters[-1]))
-    # The fit is relative to the IMU, the parameters are relative to the vehicle's origin
+    # The fitted lever arm is relative to the IMU, EKF2's parameters are relative to the vehicle's
+    # origin: add the position of the IMU
     fitted_parameters[:2] += find_imu_position_m(flight)[:2]
     lever_arm = _make_lever_arm(fitted_parameters, covariance, rotation_deg)
     min_length_m = max(MIN_REPORTED_LEVER_ARM_M, MIN_LEVER_ARM_SIGMAS * lever_arm.sigma_m)

@@ -41,11 +41,12 @@ from .model import HeadingSource
 
 # Interval T (s) of a second difference p(t + T) - 2 p(t) + p(t - T)
 SECOND_DIFFERENCE_WINDOW_S = 2.0
-# Sample interval (s) of the second differences
+# Interval (s) between successive second differences of the position
 GRID_INTERVAL_S = 0.1
-# Integration step (s) of the IMU
+# Integration step (s) of accelerometer and gyroscopes
 INTEGRATION_STEP_S = 0.02
-# Length (s) of the running mean that is subtracted from the second differences (high pass)
+# High-pass filter of the second differences of the position: length (s) of the running mean that is
+# subtracted
 HIGH_PASS_WINDOW_S = 12.0
 # Length (s) of the centred running mean of the specific force that defines the vertical
 LEVELLING_WINDOW_S = 40.0

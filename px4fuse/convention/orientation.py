@@ -42,19 +42,23 @@ QUATERNION_ORDERS: tuple[QuaternionOrder, QuaternionOrder] = ("w x y z", "x y z 
 MAX_DIFFERENCE_OF_ATTITUDE_COPY_DEG = 0.15
 # Tested delays (s) of an orientation that may be a copy of EKF2's attitude
 COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
-# If the median tilt difference (°) between orientation and gyroscope attitude is larger with the
-# best convention, the orientation is unrelated to the vehicle's attitude
+# Convention of an orientation: quaternion order and frames. If the median tilt difference (°)
+# between orientation and gyroscope attitude exceeds this value even with the best convention, the
+# orientation is unrelated to the vehicle's attitude
 MAX_TILT_DIFFERENCE_DEG = 6.0
-# If the median heading difference (°) between orientation and gyroscope attitude is larger with
-# the best convention, the orientation is unrelated to the vehicle's attitude
+# If the median heading difference (°) between orientation and gyroscope attitude exceeds this value
+# even with the best convention (quaternion order, frames), the orientation is unrelated to the
+# vehicle's attitude
 MAX_HEADING_DIFFERENCE_DEG = 12.0
-# The score of a quaternion convention measures its agreement with the reference attitude. Lower
-# limit (°) of the median angle differences in the score: smaller differences are noise
+# The score of a convention (quaternion order, frames) measures its agreement with the reference
+# attitude. Lower limit (°) of the median angle differences in the score: smaller differences are
+# noise
 MIN_ANGLE_DIFFERENCE_IN_SCORE_DEG = 0.7
-# The score decreases by this factor · duration (s) · ln(median angle difference)
+# The score of a convention (quaternion order, frames) decreases by this factor · duration (s) ·
+# ln(median angle difference to the reference attitude)
 ANGLE_DIFFERENCE_WEIGHT_PER_S = 0.5
-# For the verdict "determined", the score of the best convention must exceed that of the second best
-# by this value
+# For the verdict "determined", the score of the best convention (quaternion order, frames) must
+# exceed that of the second best by this value
 MIN_CONVENTION_SCORE_LEAD = 4.0
 MAX_ORIENTATION_COUNT = 600
 MIN_ORIENTATION_COUNT = 20
@@ -119,7 +123,8 @@ def determine_orientation_convention(
     ]
     candidates.sort(key=lambda candidate: -candidate.score)
     best_candidate = candidates[0]
-    # Conventions that differ only in heading do not compete
+    # Conventions (quaternion order, frames) that differ only in heading are not alternatives: the
+    # heading error is determined with the positions
     second_best_candidate = next(
         candidate
         for candidate in candidates
