@@ -21,18 +21,20 @@ from .replay_segments import INNOVATION_LOW_PASS_TIME_CONSTANT_S
 BAROMETER_FUSION_RATE_HZ = 10.0
 # Rate (Hz) at which EKF2 fuses the barometer before PX4 v1.15
 BAROMETER_FUSION_RATE_HZ_BEFORE_V1_15 = 15.0
-# The sample interval is estimated at each bias update in the log. The median is used only if the
-# interquartile range ÷ median of the estimates is below this value
+# The interval of EKF2's barometer samples is estimated at each logged update of the barometer bias.
+# The median is used only if the interquartile range ÷ median of the estimates is below this value
 MAX_RELATIVE_SPREAD_OF_INTERVALS = 0.1
 # Barometer samples from two parts of the log are the same sample if their times differ by less than
 # this fraction of the sample interval
 SAME_SAMPLE_TOLERANCE_IN_INTERVALS = 0.3
-# Maximum number of barometer samples that are reconstructed between two rows of the log
+# Maximum number of barometer samples that are reconstructed between two rows of
+# estimator_aid_src_baro_hgt
 MAX_SAMPLES_BETWEEN_LOGGED_ROWS = 30
-# Maximum weight of a logged barometer sample; the weight is above 1 if neighbouring samples are
-# missing in the log
+# The weight of a logged barometer sample is the number of EKF2 samples that it represents in the
+# replay. It is above 1 if neighbouring samples are missing. Maximum weight
 MAX_BAROMETER_SAMPLE_WEIGHT = 4.0
-# Lower limit of a sum of low-pass filter weights, to avoid a division by zero
+# Lower limit of the sum of the low-pass filter weights of all missing samples in an interval; it
+# avoids a division by zero if no sample is missing
 MIN_WEIGHT_SUM_OF_MISSING_SAMPLES = 1e-9
 
 
@@ -43,8 +45,9 @@ def estimate_barometer_interval_s(fusion_record: FusionRecord) -> float:
     """
     barometer_bias_updates = fusion_record.height_bias_updates.get(BAROMETER.name)
     if barometer_bias_updates is not None and len(barometer_bias_updates) > 1:
-        # Bias variance before an update: K S. In the steady state, it exceeds the variance after
-        # an update by the process noise of one sample interval. The first fifth may be transient
+        # P of the barometer bias before an update is K S. In the steady state, it exceeds P after
+        # an update by the process noise of one sample interval. The first fifth of the updates is
+        # omitted, because it may not be in the steady state
         prior_variance_m2 = barometer_bias_updates["variance_m2"] * _compute_bias_gain(
             barometer_bias_updates
         )
@@ -171,7 +174,7 @@ def _combine_barometer_samples(
     )
     row_index = np.minimum(row_index, len(sample_count) - 1)
     intervals_since_row = (time_s - row_times_s[row_index]) / sample_interval_by_row_s[row_index]
-    # Number of the sample since the previous row, from 1 to sample_count
+    # Samples between two rows of the log are numbered from 1 to sample_count
     sample_number = np.rint(intervals_since_row).astype(int)
     is_on_sample_grid = (
         is_regular[row_index]
@@ -237,15 +240,16 @@ def _simulate_missing_innovations(
     low_pass_filtered_innovation_m : ndarray, shape (n + 1,)
         Logged low-pass filtered innovations.
     """
-    # With the weight w of a new sample, the logged filtered innovation after the samples ν of age
-    # k - 1 to 0 is f = (1 - w)^k f_previous + Σ w (1 - w)^age ν. All missing innovations of an
-    # interval are shifted by the same offset, so that this equation holds
+    # EKF2 filters each innovation ν with f = (1 - w) f_previous + w ν. Age: number of samples from
+    # a sample to the next row of the log. After k samples (age k - 1 to 0), f = (1 - w)^k
+    # f_previous + Σ w (1 - w)^age ν. All simulated innovations of an interval are shifted by the
+    # same offset, so that f is the logged value
     w = interval_s / (interval_s + INNOVATION_LOW_PASS_TIME_CONSTANT_S)
     low_pass_weight = w * (1.0 - w) ** np.maximum(age_in_samples, 0.0)
     simulated_innovation_m = np.random.default_rng(0).normal(
         scale=np.nanstd(innovation_m), size=innovation_m.shape
     )
-    # Columns after the last sample are neither missing nor known
+    # An interval with fewer samples than columns is padded with NaN, which is not replaced
     filled_innovation_m = np.where(is_missing, simulated_innovation_m, innovation_m)
     previous_filtered_innovation_weight = (1.0 - w[:, 0]) ** (age_in_samples[:, 0] + 1.0)
     simulated_innovation_offset_m = (

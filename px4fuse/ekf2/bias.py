@@ -16,12 +16,12 @@ POSITION_BIAS_NOISE_M_PER_SQRT_S = 0.13
 MIN_POSITION_BIAS_VARIANCE_M2 = 1e-8
 # EKF2 updates the height or vision bias only with innovations inside this gate (√S)
 POSITION_BIAS_GATE = 3.0
-# Above this mean test ratio, EKF2 considers the estimated bias wrong (isOffsetDetected,
-# bias_estimator.cpp)
+# If the mean test ratio of the bias filter exceeds this value, EKF2 considers the estimated sensor
+# bias wrong (isOffsetDetected, bias_estimator.cpp)
 MAX_MEAN_TEST_RATIO_OF_VALID_BIAS = 0.2
-# Factor on the random walk variance of a bias that EKF2 considers wrong
+# Factor on the random walk variance of a sensor bias that EKF2 considers wrong
 RANDOM_WALK_VARIANCE_FACTOR_OF_WRONG_BIAS = 1e3
-# Time constant (s) of the low-pass filter of the test ratio
+# Time constant (s) of the low-pass filter that gives the mean test ratio of the bias filter
 TEST_RATIO_TIME_CONSTANT_S = 10.0
 
 
@@ -72,7 +72,8 @@ class BiasEstimator:
             POSITION_BIAS_NOISE_M_PER_SQRT_S**2,
         )
         bias_variance = np.minimum(self.variance_m2 + bias_noise_m2_per_s * interval_s, R_m2)
-        # The bias is state minus measurement: it is added to ν, and its own innovation is -ν
+        # The sensor bias is state minus measurement. It is therefore added to the innovation ν,
+        # which is measurement minus state. The innovation of the bias filter is -ν
         innovation_m = innovation_m + self.bias_m
         R = R_m2 + bias_variance
         # The mean of n samples has 1/n of the variance of one sample; the bias is the same for all
@@ -83,7 +84,7 @@ class BiasEstimator:
         self.variance_m2 = np.maximum(
             bias_variance - K * bias_variance, MIN_POSITION_BIAS_VARIANCE_M2
         )
-        # EKF2 filters the test ratio with the sign of the bias innovation, which is opposite to ν
+        # EKF2 low-pass filters the test ratio with the sign of the bias filter's innovation, -ν
         signed_test_ratio = np.copysign(np.minimum(test_ratio, 1.0), -innovation_m)
         self.mean_signed_test_ratio = self.mean_signed_test_ratio + (
             self.test_ratio_filter_weight

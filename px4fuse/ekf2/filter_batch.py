@@ -74,7 +74,8 @@ class FilterConfiguration:
     def compute_delays(self, inputs: ReplayInputs) -> FusionDelays:
         """Return the delay of the position source, and the delay of the fusion horizon."""
         if self.timestamp_offset_s is not None:
-            # Without the half prediction step that EKF2 subtracts, and without late samples
+            # This delay cancels the half prediction step that EKF2 subtracts from timestamps. With
+            # an infinite delay of the fusion horizon, no sample is late
             return FusionDelays(-self.timestamp_offset_s - 0.5 * inputs.mean_step_s, np.inf)
         delay_s = self.settings[inputs.aid.delay] * 1e-3
         delays_ms = [self.settings.get(aid.delay, 0.0) for aid in (GNSS_POS, EV_POS)]
@@ -120,7 +121,8 @@ class FilterBatch:
             name: np.array([configuration.settings[name] for configuration in configurations])
             for name in inputs.settings
         }
-        # A parameter change in flight applies only to filters with the logged parameter value
+        # If a parameter changed in flight, apply the change only to configurations with the logged
+        # value of the parameter, not to those that test another value
         for name, changed_value in segment.changed_parameters.items():
             if name in self.parameters:
                 values = self.parameters[name]

@@ -405,7 +405,8 @@ class _PositionFusion:
         if batch.inputs.aid != GNSS_POS:
             return x, P
         if batch.segment.magnetic_field is None:
-            # Without a magnetometer, the tilt variance is set to its logged value
+            # Without a magnetometer, the replay uses EKF2's logged tilt variances: reduce the tilt
+            # variances of P to them, without a change of the tilt
             logged_variance = batch.segment.attitude_variance_rad2[batch.event_steps[event]]
             for tilt_row in range(HEADING):
                 noise = _compute_noise_for_target_variance(
@@ -600,7 +601,7 @@ class _FusionDecisions:
             (action == START_FUSION) | (self.is_stopped & self.can_start_fusion[event])
         )
         if not (is_reset_logged or (is_rejected | self.is_stopped | is_fusion_starting).any()):
-            # This is the case for most samples
+            # Most samples: no filter rejects the sample, restarts fusion or resets its position
             self.last_position_s = np.where(may_fuse, now_s, self.last_position_s)
             return is_rejected, may_fuse, np.zeros_like(may_fuse), is_velocity_fused
         uses_logged_resets = self.uses_logged_decisions & (
@@ -677,7 +678,8 @@ def estimate_state_correlation(inputs: ReplayInputs, segment: ReplaySegment) -> 
         run = run_segment(inputs, first_segment, [configuration], [intervals])
         initial_state_correlation = _compute_correlation(run.covariance[0])
     if segment.magnetic_field is not None:
-        # EKF2 has just reset heading and magnetic fields, so they are uncorrelated
+        # EKF2 has just reset heading and magnetic fields, so their errors are uncorrelated with all
+        # other states and with each other
         initial_state_correlation = block_diag(
             initial_state_correlation[:STATE_COUNT, :STATE_COUNT],
             np.eye(len(segment.state) - STATE_COUNT),
@@ -709,7 +711,8 @@ def _compute_steady_state_correlation(segment: ReplaySegment) -> Array:
         (1, ACCELEROMETER_BIAS_NORTH, -GRAVITY_MAGNITUDE_M_S2),
         (0, ACCELEROMETER_BIAS_EAST, GRAVITY_MAGNITUDE_M_S2),
     ):
-        # The smaller of the two acceleration variances is common to both errors
+        # The tilt error and the bias error cause acceleration errors that cancel. Their covariance
+        # is the smaller of their two variances
         common_variance = min(
             P[tilt_state, tilt_state] * acceleration_per_rad**2, P[bias_state, bias_state]
         )
@@ -737,8 +740,8 @@ def _make_start_state(batch: FilterBatch, bad_acceleration_flag: BadAcceleration
         (ACCELEROMETER_BIAS, batch.estimates_biases, bias_error_m_s2),
     ):
         set_states(x, P, ~is_estimated, rows, value, zeros)
-    # While EKF2 flags a bad acceleration, the log contains no accelerometer bias. Start with the
-    # mean vertical bias of the segment
+    # While EKF2 flags a bad acceleration, the log contains no accelerometer bias. The replay then
+    # starts with the mean vertical bias of the segment, from IMU and logged velocity
     is_bias_unknown = (
         (bad_acceleration_flag.until_s > segment.time_s[0])
         & ~bad_acceleration_flag.uses_logged_flag

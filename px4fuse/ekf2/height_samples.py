@@ -59,7 +59,7 @@ def add_heights(
         (reference,) = fused_aids
     if reference not in fused_aids:
         return "EKF2's height reference is neither GNSS nor barometer, or not logged"
-    # At most one sensor, whose bias EKF2 estimates
+    # The other height sensor, if any: EKF2 estimates its bias relative to the height reference
     other_aids = {*fused_aids} - {reference}
     barometer_samples = pd.DataFrame(columns=["down_m", "weight"], dtype=float)
     if BAROMETER.name in fused_aids and flight.barometer is not None:

@@ -74,11 +74,12 @@ class BadAccelerationFlag:
             logged_flag = np.zeros(len(time_s), bool)
         self.uses_logged_flag = uses_logged_flag
         self.flag_duration_s = flag_duration_s
-        # Start and end (s) of each logged time with a set flag; the last may have no end
+        # Start and end (s) of each logged time span in which EKF2 flags a bad acceleration; the
+        # last span may have no end
         flag_change_steps = np.flatnonzero(np.diff(logged_flag, prepend=False, append=False))
         self.logged_spans_s = np.append(time_s, np.inf)[flag_change_steps].reshape(-1, 2)
         self.since_s = np.full(len(uses_logged_flag), time_s[0])
-        # A flag that is set at the start is set for the usual time
+        # If the flag is set at the start of the segment, it remains set for flag_duration_s
         self.until_s = self.since_s + flag_duration_s * float(logged_flag[0])
 
     def compute_bad_acceleration_fraction(self, begin_s: Array, end_s: Array) -> Array:
@@ -86,7 +87,8 @@ class BadAccelerationFlag:
 
         Call this method in time order.
         """
-        # Logged flags: the latest span that begins before the end of the interval
+        # Filters that use the logged flag: select the latest logged span that begins before the end
+        # of the interval
         if len(self.logged_spans_s):
             last_row = np.searchsorted(self.logged_spans_s[:, 0], end_s) - 1
             is_flag_from_log = self.uses_logged_flag & (last_row >= 0)
@@ -113,8 +115,9 @@ class BadAccelerationFlag:
         """
         *previous_barometer, previous_gnss = previous_innovations
         *barometer, gnss = innovations
-        # EKF2 tests the latest innovation of each height sensor after each fusion: the last samples
-        # of the previous event again, then the barometer samples and the GNSS sample of this event
+        # EKF2 tests the latest innovations of barometer and GNSS after each fusion. Test them in
+        # this sequence: last samples of the previous event, each barometer sample of this event,
+        # GNSS sample of this event
         latest_barometer = np.full_like(gnss, np.nan)
         for sample in previous_barometer:
             latest_barometer = np.where(np.isnan(sample), latest_barometer, sample)
@@ -300,6 +303,7 @@ class HeightFilter:
         self.update_records[event, sample_index] = np.where(
             has_sample, (nu, S, ~is_fused, is_fused), np.nan
         )
-        # A sample that represents n EKF2 samples has 1/n of their noise; the gate is that of one
+        # A sample that represents n EKF2 samples is fused with 1/n of their noise. The gate test
+        # above uses the noise of one EKF2 sample
         K = PH * (is_fused / (predicted_variance + R / weight))[:, None]
         return x + K * nu[:, None], P - K[:, :, None] * PH[:, None]

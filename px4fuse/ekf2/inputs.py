@@ -79,7 +79,8 @@ GNSS_VELOCITY_BIT = 4
 MAX_RESET_PUBLICATION_DELAY_S = 0.2
 # Maximum median IMU interval (s) for an EKF2 replay: EKF2 predicts every 8 to 13 ms
 MAX_IMU_INTERVAL_S = 0.012
-# Maximum fraction of missing IMU samples for an EKF2 replay; gaps do not count
+# Maximum fraction of IMU samples that are missing between logged samples, for an EKF2 replay. Gaps
+# in the IMU data are not counted
 MAX_MISSING_IMU_FRACTION = 0.1
 # First PX4 release with the time of the fusion horizon in estimator_states
 FIRST_RELEASE_WITH_HORIZON_TIMES = "PX4 v1.13"
@@ -400,7 +401,8 @@ def _make_fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: b
         )
     return replace(
         fusion_rules,
-        # EKF2 up to v1.14 limits the variance of the velocity change by the bias in one step
+        # EKF2 up to v1.14 has a lower limit (5e-8 m²/s²) for the variance of the velocity change
+        # that the accelerometer bias causes in one prediction step
         min_accelerometer_bias_variance_m2_s4=5e-8 / step_s**2
         if fusion_record.has_delta_angle_biases
         else None,
@@ -607,7 +609,7 @@ def _read_logged_decisions(
     for begin, end in rejection_rows:
         rejected_flags[begin : max(end - 1, 0)] = 1.0
     may_be_reset_sample = np.isnan(rejected_flags)
-    # Logged decisions on single samples
+    # The log contains EKF2's decision (fused or rejected) on some of the samples
     innovation_rows = find_matching_samples(innovations.index.to_numpy(), measurement_times_s)
     is_logged = innovation_rows >= 0
     innovations_of_samples = innovations.iloc[innovation_rows[is_logged]]
@@ -624,12 +626,14 @@ def _read_logged_decisions(
         )
         reset_rows = np.flatnonzero(is_published_near_reset & may_be_reset_sample)
         rows_after_dead_reckoning = np.intersect1d(reset_rows, last_rows_of_dead_reckoning)
-        # A reset ends dead reckoning; otherwise, it is to the newest sample
+        # If a possible reset sample ended dead reckoning, EKF2 reset its position to it. Otherwise,
+        # the reset is to the newest possible sample
         if len(rows_after_dead_reckoning):
             is_reset[rows_after_dead_reckoning[0]] = True
         elif len(reset_rows):
             is_reset[reset_rows[-1]] = True
-    # The samples of the last fusions are not rejected
+    # The sample at each logged time of the last fusion (last_fused_s) was fused, so it was not
+    # rejected
     fused_rows = last_fusion_rows[last_fusion_rows > 0] - 1
     is_undecided = ~is_reset[fused_rows] & np.isnan(rejected_flags[fused_rows])
     rejected_flags[fused_rows[is_undecided]] = 0.0

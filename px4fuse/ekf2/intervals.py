@@ -41,9 +41,10 @@ MAX_DELAY_BEHIND_HORIZON_S = 0.1
 MIN_DELAY_OF_LATE_SAMPLE_S = 0.03
 # Actions of EKF2 on a position sample; START_FUSION resets the position to the sample
 NO_ACTION, FUSE, START_FUSION = 0, 1, 2
-# Effects on attitude, velocity and position in an interval, by column. Derivatives with respect to
-# initial attitude error (0 to 2), gyro bias (3 to 5) and accelerometer bias (6 to 8); then changes
-# due to the correction of the nominal attitude (9) and due to the measured acceleration (10)
+# Columns of the derivatives of attitude, velocity and position at the end of an interval between
+# two events. They are with respect to initial attitude error (0 to 2), gyro bias (3 to 5) and
+# accelerometer bias (6 to 8). The last two columns are state changes by EKF2's attitude correction
+# (9) and by the measured acceleration (10)
 DERIVATIVE_COLUMN_COUNT = 11
 COLUMN_OF_DERIVATIVE_BY_ATTITUDE_CORRECTION, COLUMN_OF_DERIVATIVE_BY_ACCELERATION = 9, 10
 
@@ -180,7 +181,8 @@ def _make_fusion_events(
     event_row_by_sample = np.cumsum(event_counts_in_gaps[:-1] + 1) - 1
     event_count = len(timestamp_s) + int(event_counts_in_gaps.sum())
     events = np.zeros(event_count, EVENT_DTYPE).view(np.recarray)
-    # The events in a gap divide it into equal numbers of prediction steps
+    # In a gap of the position source, events without a position divide the gap into equal numbers
+    # of prediction steps
     events.end_step = np.rint(
         np.interp(
             np.arange(event_count),
@@ -223,8 +225,8 @@ def _find_fusion_actions(
     can_start_fusion[usable_rows] = (
         np.diff(usable_times_s, prepend=-np.inf) < fusion_rules.max_sample_interval_to_start_s
     )
-    # EKF2 checks the stop timeout in each prediction step: the last check without the new sample is
-    # in the step before its fusion
+    # EKF2 stops position fusion after stop_timeout_s without a sample. It checks this time in each
+    # prediction step. The last check without the new sample is in the step before its fusion
     sample_gaps_s = segment.time_s[end_steps[usable_rows] - 1] - np.append(
         np.inf, usable_times_s[:-1]
     )

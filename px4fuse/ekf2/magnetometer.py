@@ -44,9 +44,9 @@ def average_by_event(
     segment: ReplaySegment, sensor_samples: SensorSamples, event_end_steps: IntArray
 ) -> EventSamples:
     """Return the mean of the magnetometer or optical flow samples before each fusion."""
-    # The samples may be means of several EKF2 samples, whose numbers are added
+    # Index of the event (fusion) at or after each sample
     event_index = np.searchsorted(event_end_steps, sensor_samples.step_indices)
-    # The last row contains the samples after the last event
+    # Samples after the last event are in an additional last row, which is not returned
     row_count = len(event_end_steps) + 1
     sample_count_by_event = np.maximum(np.bincount(event_index, minlength=row_count), 1)
 
@@ -59,9 +59,11 @@ def average_by_event(
         mean, (sensor_samples.value, sensor_samples.ned_to_body_rotation, sensor_samples.noise)
     )
     if VELOCITY in sensor_samples.state_slices:
-        # The IMU velocity change, which was subtracted from optical flow, is added again
+        # The optical flow samples do not contain the velocity change from the IMU since the start
+        # of the segment. Add it, as it is at the event
         velocity_m_s = segment.imu_velocity_change_m_s[event_end_steps]
         value = value + np.einsum("eab,eb->ea", ned_to_body_rotation, velocity_m_s)
+    # A sample can itself be the mean of several EKF2 samples: add their numbers
     sample_count = np.bincount(event_index, sensor_samples.sample_count, row_count)[:-1]
     return EventSamples(
         value, ned_to_body_rotation, np.asarray(sample_count, float), noise_variance

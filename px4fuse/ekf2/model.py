@@ -115,7 +115,8 @@ def prepare_ekf2_model(
         Function that returns the filter configurations that later analyses need. They are computed
         together with the logged configuration, which is faster.
     """
-    # Agreement of the replay that still fused an omitted source, by PX4's name of the source
+    # For each omitted aiding source (PX4's name): agreement with the log of the replay that still
+    # fused it
     failed_agreement_by_aid: dict[str, ReplayAgreement] = {}
     while True:
         omitted_aids = {
@@ -493,14 +494,16 @@ def _make_state_tracks(
     segment = run.segment
     configuration = run.configurations[configuration_index]
     state = compute_delayed_states(run, configuration_index)
-    # Position resets since the start, after each step
+    # Change of the position by resets in each prediction step
     reset_m = np.zeros((len(state), 3))
     event_steps = run.events[configuration_index].end_step
     np.add.at(reset_m[:, :2], event_steps, run.position_reset_m[:, configuration_index])
     horizon_s = min(configuration.compute_delays(inputs).horizon_s, MAX_HORIZON_DELAY_S)
-    # Steps from the fusion horizon to the present, for which the output predictor predicts
+    # Number of prediction steps from the fusion horizon to the present, over which the output
+    # predictor extrapolates
     lag_steps = max(round(horizon_s / inputs.mean_step_s), 1)
-    # Without attitude states, EKF2's published attitude is not corrected
+    # If attitude is not a state of the filter configuration, EKF2's published attitude is used
+    # without a correction
     attitude_correction_rad = np.zeros((len(state), 3))
     if configuration.estimates_attitude:
         attitude_correction_rad = sum_attitude_corrections(

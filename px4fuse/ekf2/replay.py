@@ -64,16 +64,19 @@ MAX_POSITION_DIFFERENCE_FROM_LOG_M = 0.10
 # Maximum position difference (m) between replay and log while EKF2 fuses only optical flow
 # horizontally
 MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
-# With a larger rejected fraction, replayed and logged innovations need not correlate: one different
-# rejection changes all later innovations. Rejected fraction and mean NIS are compared instead
+# If EKF2 rejects more than this fraction of the positions, replayed and logged innovations need not
+# correlate: one different rejection changes all later innovations. Rejected fraction and mean NIS
+# are compared instead
 MAX_REJECTED_FRACTION_FOR_COMPARISON = 0.05
-# Above this rejected fraction, EKF2's position is mostly integrated from the IMU
+# If EKF2 rejects more than this fraction of the positions, EKF2's position is mostly integrated
+# from the IMU
 MOSTLY_REJECTED_FRACTION = 0.5
-# Minimum correlation of innovations if EKF2 rejects more than MOSTLY_REJECTED_FRACTION
+# Minimum correlation of replayed and logged innovations if EKF2 rejects more than
+# MOSTLY_REJECTED_FRACTION of the positions
 MIN_CORRELATION_IF_MOSTLY_REJECTED = 0.99
-# Maximum difference of the rejected fractions in replay and log
+# Maximum difference between the fractions of rejected positions in replay and log, if they agree
 MAX_REJECTED_FRACTION_DIFFERENCE = 0.05
-# Maximum relative difference of the mean NIS in replay and log
+# Maximum relative difference of the mean NIS in replay and log, if they agree
 MAX_RELATIVE_NIS_DIFFERENCE = 0.25
 # Factor on MAX_POSITION_DIFFERENCE_FROM_LOG_M for flights with many rejections
 DIFFERENCE_FACTOR_WITH_MANY_REJECTIONS = 3.0
@@ -250,7 +253,8 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> ReplayAgreement | Un
         )
     agreement_by_axis, statistics = comparison
     agreement_by_aid, omitted_aids = _compare_other_aids(ekf2, replay, state_difference)
-    # While EKF2 fuses only optical flow, position errors add up: the largest difference is compared
+    # While EKF2 fuses only optical flow, position errors accumulate. Replay and log are therefore
+    # compared by their largest position difference
     flow_only_difference = _subtract_logged_state(
         replay, rows_inside(ekf2.state, replay.optical_flow_only_spans_s)
     )
@@ -369,8 +373,9 @@ def _compare_other_aids(
     for name, updates in replay.other_aid_updates.items():
         if (aid_log := ekf2.aids.get(name)) is None:
             continue
-        # Without logged measurement times, innovations are matched by fusion time. The replay fuses
-        # barometer samples later than EKF2, so the measurement time replaces their fusion time
+        # If the log contains no measurement times, replayed and logged innovations are matched by
+        # fusion time. The replay fuses barometer samples later than EKF2, so they are matched by
+        # measurement time
         times_s = updates.index if name == BAROMETER.name else updates["fused_at_s"]
         comparison = _compare_innovations(
             replay,
@@ -379,7 +384,8 @@ def _compare_other_aids(
             innovation_topic(AIDS[name]) in aid_log.topics,
             state_difference,
         )
-        # GNSS velocity is omitted only if its innovations are constant, as those of a frozen sensor
+        # Replayed and logged GNSS velocity innovations may disagree. GNSS velocity is omitted from
+        # the replay only if its innovations are constant, as those of a frozen sensor
         may_disagree = name == GNSS_VEL.name
         if isinstance(comparison, str):
             if not may_disagree or comparison == CONSTANT_INNOVATIONS_REASON:

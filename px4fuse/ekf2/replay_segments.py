@@ -64,7 +64,7 @@ MIN_TIME_SINCE_TAKEOFF_S = 4.0
 # Time (s) from the start of a replay to the start of the evaluation
 REPLAY_SETTLING_S = 5.0
 # EKF2's first fusion of all magnetometer axes resets the magnetic field states. The replay uses
-# these states after this time (s)
+# these states from this time (s) after the reset
 MAGNETIC_FIELD_SETTLING_S = 1.0
 # Correlations of the initial state are estimated by a replay of this time (s) before a segment
 CORRELATION_ESTIMATION_TIME_S = 20.0
@@ -273,7 +273,7 @@ def group_samples_by_event(
         with the IMU, so that each measures position - age · velocity at the event.
     """
     event_indices = np.searchsorted(event_steps, measurement_step_indices)
-    # Samples after the last event are not used
+    # Samples that are measured after the last event are not fused
     sample_count = int(np.searchsorted(event_indices, len(event_steps)))
     event_indices, measurement_step_indices = (
         event_indices[:sample_count],
@@ -378,7 +378,8 @@ def find_replay_segments(
         change for change in ekf2.parameter_changes if change.name in MODEL_PARAMETERS
     ]
     boundary_times_s += [magnetic_field_end_s, *(change.time_s for change in parameter_changes)]
-    # The limits of the last IMU interval and of the last position are included
+    # The replay can start up to MIN_IMU_GAP_S before the first IMU sample. It can end up to
+    # MIN_IMU_GAP_S after the last IMU sample, and 1 s after the last position
     earliest_start_s = max(attitude.index[0], imu_times_s[0] - MIN_IMU_GAP_S, position_times_s[0])
     end_s = min(attitude.index[-1], imu_times_s[-1] + MIN_IMU_GAP_S, position_times_s[-1] + 1.0)
     takeoff_s = -np.inf
@@ -408,7 +409,7 @@ def find_replay_segments(
             or part_end_s - state_times_s[start_row] < MIN_SEGMENT_DURATION_S
         ):
             continue
-        # The part may itself be a gap of the IMU
+        # The part between two boundary times may itself be a gap of the IMU data
         is_covered = (imu_times_s[1:] > state_times_s[start_row]) & (imu_times_s[:-1] < part_end_s)
         if not np.all(np.diff(imu_times_s)[is_covered] <= MIN_IMU_GAP_S):
             continue
@@ -759,10 +760,11 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     step_index, weight = compute_low_pass_weights(
         segment, flow.index.to_numpy(), sample_count, interval_s, FLOW_FILTER_NEW_SAMPLE_WEIGHT
     )
-    # Axes forward and right
+    # Rotation from NED to the body axes forward and right
     ned_to_body_rotation = segment.body_to_ned[step_index].swapaxes(2, 3)[:, :, :2]
-    # Mean over the samples (i) of each mean (k): velocity change from the IMU in body axes. Without
-    # it, the samples of one mean measure the same velocity
+    # For each mean (k) of flow samples (i): weighted mean of the velocity change from the IMU since
+    # the start of the segment, in body axes. Without this velocity change, all samples of a mean
+    # measure the same velocity
     imu_velocity_m_s = np.einsum(
         "ki,kiab,kib->ka", weight, ned_to_body_rotation, segment.imu_velocity_change_m_s[step_index]
     )
@@ -892,7 +894,8 @@ def find_step_ends(
     ):
         accumulated_count += sample_count
         accumulated_time_s += interval
-        # A step ends after a number of samples, at a time limit, or where the log contains a state
+        # A prediction step ends after a number of IMU samples, at a time limit, or at a logged EKF2
+        # state
         if (
             (accumulated_count >= samples_per_step and accumulated_time_s > 0.5 * configured_step_s)
             or accumulated_time_s > configured_step_s

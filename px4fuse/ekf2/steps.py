@@ -48,7 +48,8 @@ NO_TRUTH_OVERLAP = Unavailable(
     "ground truth and replay do not overlap in time",
     "Record ground truth during the whole flight.",
 )
-# Names of the replaced properties, in which KF and EKF2 differ
+# Names of the properties in which KF and EKF2 differ. One after the other is changed from KF's to
+# EKF2's property
 SAMPLE_TIMES_REPLACEMENT_NAME = "sample times and time steps"
 TIMESTAMPS_REPLACEMENT_NAME = "timestamps and delay"
 MEASUREMENT_NOISE_REPLACEMENT_NAME = "measurement noise"
@@ -61,7 +62,8 @@ FLOW_REPLACEMENT_NAME = "optical flow"
 VISION_REPLACEMENT_NAME = "external vision"
 REJECTION_REPLACEMENT_NAME = "rejections and resets"
 OUTPUT_PREDICTOR_REPLACEMENT_NAME = "output predictor"
-# Replacements that add an aiding source, by PX4's name of the source
+# Properties that consist of the fusion of a further aiding source by EKF2, by PX4's name of the
+# source
 REPLACEMENT_NAME_BY_ADDITIONAL_AID = {
     FLOW.name: FLOW_REPLACEMENT_NAME,
     EV_POS.name: VISION_REPLACEMENT_NAME,
@@ -206,7 +208,8 @@ def explain_difference_by_replacements(
         )
     state_span_s = float(state_times_s[0]), float(state_times_s[-1])
     replacement_names = (*configurations, OUTPUT_PREDICTOR_REPLACEMENT_NAME)
-    # Only the replays of the last two properties contain EKF2's rejections
+    # Only the tracks of the last two properties (rejections, output predictor) contain EKF2's
+    # rejections
     *_, last_property_without_gate, _, _ = replacement_names
     # Position and velocity of each track along each axis
     states_by_track = []
@@ -342,7 +345,8 @@ def make_replacement_configurations(
         disable_time_s_by_aid=dict.fromkeys((MAG.name, *additional_aids), 0.0),
         timestamp_offset_s=kf_settings.clock_offset_s - applied_delay_s,
     )
-    # Changed fields of the configuration, in the order of the replacements
+    # For each property, the fields of FilterConfiguration that change from KF to EKF2, in the order
+    # of the replays
     replacements: dict[str, dict[str, Any]] = {
         TIMESTAMPS_REPLACEMENT_NAME: {
             "settings": {**logged_settings, **kf_noises},
@@ -393,12 +397,13 @@ def _find_longest_rejection(
     fusion_times_s = updates["fused_at_s"].to_numpy()
     if not is_rejected.any():
         return None
-    # Rows of the first rejected sample, and of the next fused sample, of each series
+    # For each series of successive rejected samples: row of the first rejected sample, and row of
+    # the next fused sample
     change_rows = np.flatnonzero(np.diff(is_rejected, prepend=False, append=False))
     run_starts, run_ends = change_rows.reshape(-1, 2).T
     longest_index = int(np.argmax(run_ends - run_starts))
     begin_s = fusion_times_s[run_starts[longest_index]]
-    # The last series may continue to the end of the flight
+    # If the longest series continues to the end of the flight, there is no next fused sample
     end_s = fusion_times_s[min(run_ends[longest_index], len(fusion_times_s) - 1)]
     fusion_horizon_track = baseline_replay.delayed_state.loc[begin_s:end_s]
     position_difference = [

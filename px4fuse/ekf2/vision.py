@@ -110,7 +110,8 @@ class VisionFilter:
         self.update_records = np.full((event_count, sample_count, 7, configuration_count), np.nan)
         self.position_reset_m = np.zeros((event_count, configuration_count, 2))
         has_sample = (samples[7] > 0.0) & is_enabled_by_aid[EV_POS.name]
-        # Samples of the same prediction step as GNSS (age 0) are fused after GNSS, as in EKF2
+        # Vision samples before the GNSS sample of an event, and vision samples in the same
+        # prediction step (age 0), which EKF2 fuses after GNSS
         self.has_sample = [has_sample & (self.age_s > 0.0), has_sample & (self.age_s == 0.0)]
         self.has_gate = batch.has_gate
         self.is_gnss_off = ~is_enabled_by_aid[GNSS_POS.name]

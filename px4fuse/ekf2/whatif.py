@@ -80,11 +80,14 @@ MAX_REJECTED_SAMPLE_FRACTION = 0.35
 # EKF2 resets the height after this time (s) without height fusion (hgt_fusion_timeout_max,
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
-# Maximum ratio of largest to smallest mean NIS of replays with different added noise
+# Replays with different added position noise must have similar statistics, otherwise EKF2 is not
+# predictable. Maximum ratio of largest to smallest mean NIS
 MAX_NIS_RATIO_BETWEEN_REPEATED_REPLAYS = 1.10
-# Maximum difference between the rejected fractions of replays with different added noise
+# Maximum difference between the rejected fractions of replays with different added position noise,
+# if EKF2 is predictable
 MAX_REJECTED_FRACTION_RANGE_OF_REPLAYS = 0.03
-# Maximum ratio of largest to smallest position RMSE of replays with different added noise
+# Maximum ratio of largest to smallest position RMSE of replays with different added position noise,
+# if EKF2 is predictable
 MAX_RMSE_RATIO_BETWEEN_REPEATED_REPLAYS = 1.15
 
 
@@ -478,7 +481,8 @@ def _make_summary(
     """
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    # σ is compared at the times of the log, so replay and log have the same number of values
+    # The median reported σ is computed at the times of the logged variances, so that the medians of
+    # replay and log are comparable
     logged_variance = ekf2.variance
     evaluated_times_s = rows_inside(ekf2.state, spans_s).index.to_numpy()
 
@@ -550,7 +554,7 @@ def _compute_heading_error_deg(
     flight: Flight, replay: Ekf2Replay, headings_rad: pd.Series, spans_s: Spans
 ) -> float | Unavailable:
     """Return the mean (°) of ``headings_rad`` minus true heading."""
-    # A replay with vision only uses EKF2's logged heading
+    # If EKF2 fuses vision without GNSS, the replay uses EKF2's logged heading
     if GNSS_POS.noise not in replay.settings:
         return HEADING_NOT_REPLAYED
     true_attitude = None if isinstance(flight.truth, Unavailable) else flight.truth.attitude
