@@ -46,35 +46,42 @@ COARSE_CORRELATION_TIMES_S = (0.2, 0.6, 2.0, 6.0)
 COARSE_CORRELATED_VARIANCE_FRACTIONS = (0.12, 0.35, 0.8)
 # Tested multiples of SIGMA_A in the coarse search
 COARSE_SIGMA_A_FACTORS = (0.4, 0.9)
-# Tested factors on all σ in the coarse search
+# Tested common factors on SIGMA_A, SIGMA_Z and the time-correlated noise, in the coarse search
 COARSE_SIGMA_FACTORS = np.geomspace(0.7, 1.6, 12)
 COARSE_SEARCH_MEASUREMENT_COUNT = 1000
-# Minimum log-likelihood gain over white noise in the coarse search; below it, no full fit is made
+# Minimum log-likelihood gain of time-correlated noise over white noise in the coarse search; below
+# it, the noises are not fitted
 MIN_GAIN_FOR_FULL_FIT_NATS = 0.5
 # Below this estimate of SIGMA_Z (m), the source probably low-pass filters its positions
 MAX_SIGMA_Z_OF_LOW_PASS_SOURCE_M = 0.01
-# Minimum log-likelihood gain over white noise to report time-correlated noise
+# Minimum log-likelihood gain of time-correlated noise over white noise, to report time-correlated
+# noise
 MIN_LIKELIHOOD_GAIN_NATS = 2.0
-# Reduction (nats) of the log-likelihood of a fit that also estimates a time offset: one more
+# Reduction (nats) of the log-likelihood of a noise fit that also estimates a time offset: one more
 # parameter (Akaike 1974)
 TIME_OFFSET_PENALTY_NATS = 2.0
-# Search range (s) of the time constant of a low pass
+# Search range (s) of the time constant of a low-pass filter in the source
 LOW_PASS_TAU_RANGE_S = (0.02, 3.0)
-# Tolerance of ln τ in the search for the time constant of a low pass
+# Tolerance of ln τ in the search for the time constant τ of a low-pass filter in the source
 LOG_TAU_TOLERANCE = 0.05
-# Maximum number of positions in the fit to ground truth, to limit computing time
+# Fit of the position errors against ground truth: maximum number of positions, to limit the
+# computing time
 MAX_MEASUREMENTS_IN_TRUTH_FIT = 300
-# Minimum log-likelihood gain over white noise in the fit to ground truth
+# Fit of the position errors against ground truth: minimum log-likelihood gain of time-correlated
+# noise over white noise
 MIN_TRUTH_LIKELIHOOD_GAIN_NATS = 5.0
 # If all position errors (m) are smaller, ground truth is a copy of the positions
 MAX_RESIDUAL_OF_COPIED_TRUTH_M = 1e-5
 # Maximum time difference (s) between a position and the nearest ground truth sample
 MAX_TRUTH_TIME_DIFFERENCE_S = 0.1
-# Number of flight parts in the fit to ground truth; each has its own time offset
+# Fit of the position errors against ground truth: number of flight parts, each with its own time
+# offset
 FLIGHT_PART_COUNT = 12
-# Tested time constants (s) in the fit to ground truth
+# Fit of the position errors against ground truth: tested time constants (s) of time-correlated
+# noise
 TESTED_CORRELATION_TIMES_S = np.geomspace(0.3, 80.0, 17)
-# Tested fractions of time-correlated errors in the error variance, in the fit to ground truth
+# Fit of the position errors against ground truth: tested fractions of time-correlated noise in the
+# error variance
 TESTED_CORRELATED_FRACTIONS = np.linspace(0.05, 0.999, 20)
 
 
@@ -127,8 +134,9 @@ class TimeCorrelatedNoise:
     low_pass_gain_nats: float
 
 
-# IMU motion of unfiltered positions, and a term to add to their negative log likelihood. The sum is
-# the negative log likelihood of the measured positions
+# Unfiltered positions are the positions before the low-pass filter of the source. First: unfiltered
+# positions and the IMU motion at their times. Second: a term to add to their negative log
+# likelihood. The sum is the negative log likelihood of the measured positions
 _UnfilteredMotion = tuple[PositionsAndImuMotion | Unavailable, float]
 
 
@@ -173,7 +181,8 @@ def _fit_low_pass(
     def fit_noises(log_tau: float) -> tuple[float, float]:
         """Return the score (-ln p) and SIGMA_Z for a given time constant."""
         motion, minus_log_jacobian = undo_low_pass(float(np.exp(log_tau)))
-        # The same positions are used for each τ. The caller found their IMU motion
+        # The times of the positions are the same for each τ. fit_time_correlation has computed the
+        # IMU motion at these times before
         assert not isinstance(motion, Unavailable)
         fit = motion.fit_noises(0.0, start_parameters)
         return fit.compute_score() + minus_log_jacobian, fit.noise_parameters.sigma_z_m

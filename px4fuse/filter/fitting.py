@@ -43,8 +43,8 @@ OUTLIER_ITERATIONS_WITH_GIVEN_NOISES = 3
 # Minimum ratio of the outliers' σ to SIGMA_Z
 MIN_OUTLIER_SIGMA_RATIO = 3.0
 MAX_OUTLIER_FRACTION = 0.4
-# To detect outliers, SIGMA_Z is limited to this multiple of a robust estimate, which is from the
-# median squared error
+# To detect outliers, SIGMA_Z is limited to this multiple of a robust estimate from the median
+# squared position error
 MAX_SIGMA_Z_TO_MEDIAN_BASED_SIGMA_Z_RATIO = 1.2
 # Convergence limit for the change of outlier probabilities
 MAX_OUTLIER_PROBABILITY_CHANGE = 0.01
@@ -326,8 +326,8 @@ def convert_to_positions_and_increments(
     prior_precision = np.zeros((measurement_count + 1, 2))
     prior_precision[0] = KNOWN_INITIAL_STATE_PRECISION
     measured_m = np.append(np.nan, preintegrated_motion.measurement_m)[:, None]
-    # One axis and one time offset. Inputs: the data, then unit errors of the initial position and
-    # of the initial velocity
+    # One axis and one time offset. Inputs: the flight data, then the effects of an initial position
+    # error of 1 m and of an initial velocity error of 1 m/s
     dp, dv = np.zeros((2, 1, 1, 3, measurement_count))
     dp[0, 0, 0] = preintegrated_motion.delta_position_m
     dv[0, 0, 0] = preintegrated_motion.delta_velocity_m_s
@@ -498,7 +498,7 @@ def _estimate_normalised_squares(
                 noisy_positions, noise_parameters.sigma_a_m_s2, variance_m2, constant_errors
             )
         )
-    # Without KF's initial state, which has no measurement
+    # Omit KF's initial state, if it is the first row: it has no measurement
     squared_errors_m2, measured_axis_counts = np.sum(squared_errors_and_axis_counts, axis=0)[
         :, -len(measurement_weights) :
     ]
@@ -530,7 +530,8 @@ def compute_variance_factor_of_ln_sigma_z(
             [0.0, 0.0, fraction_information],
         ]
     )
-    # Score of an outlier minus score of a good measurement, for each parameter
+    # Derivative of the log-likelihood of a measurement with respect to each parameter: value for an
+    # outlier minus value for a good measurement
     scores = np.stack(
         [
             normalised_squares * (inverse_outlier_variance_ratio - 1.0),

@@ -30,9 +30,9 @@ from .signals import Segment, cut_to_segment, report_too_few_measurements
 
 # Duration (s) of each flight part if the heading error is estimated from orientations
 FLIGHT_PART_DURATION_S = 2.0
-# Duration (s) of each flight part if the heading error is fitted to positions
+# Fit of the heading error to positions and IMU data: duration (s) of each flight part
 HEADING_FIT_DURATION_S = 15.0
-# Minimum duration (s) of a flight part if the heading error is fitted to positions
+# Fit of the heading error to positions and IMU data: minimum duration (s) of a flight part
 MIN_HEADING_FIT_DURATION_S = 5.0
 MIN_FLIGHT_PART_COUNT = 3
 MIN_MEASUREMENTS = 50
@@ -42,7 +42,8 @@ MAX_MEASUREMENTS = 1000
 MAX_DRIFT_P_VALUE = 0.002
 # Minimum reported change (°) of the heading error in flight
 MIN_HEADING_DRIFT_DEG = 5.5
-# Maximum yaw rate (°/s) at which headings are compared: a delay of 0.2 s causes 2° error
+# Maximum yaw rate (°/s) at which the headings of source and EKF2 are compared: a delay of 0.2 s
+# causes 2° error
 MAX_YAW_RATE_DEG_S = 10.0
 # Minimum σ (°) of a heading difference between source and EKF2
 MIN_HEADING_SIGMA_DEG = 0.5
@@ -55,8 +56,8 @@ MAX_HEADING_CHANGE_AT_CONVERGENCE_RAD = 0.01
 HEADING_SIGMA_RAD = 1.0
 # Lower limit of the estimated ratio of true to measured distances, which is a divisor
 MIN_TRUE_TO_MEASURED_SCALE = 0.1
-# Index of the heading error in the constant errors. Its index in the IMU increments is larger by 1,
-# because index 0 is the motion itself
+# Index of the heading error among the constant errors of a segment. In the IMU increments and their
+# derivatives, the index is larger by 1, because index 0 contains the increments
 HEADING_INDEX_IN_CONSTANT_ERRORS = 2
 
 
@@ -313,15 +314,17 @@ def _estimate_heading_error_from_positions(
         if abs(correction_rad) < MAX_HEADING_CHANGE_AT_CONVERGENCE_RAD:
             break
     deviation_rad = error_rad - correction_rad
-    # Variance due to drift: variance of the estimates minus their noise variance
+    # Variance of the heading error due to drift: variance of the estimates of all flight parts
+    # minus their noise variance
     variance_above_noise_rad2 = max(float(np.mean(deviation_rad**2 - heading_variance_rad2)), 0.0)
     heading_drift_variance_rad2 = 0.0 if has_constant_heading else variance_above_noise_rad2
-    # The larger its variance, the more the estimate of a part is moved to the mean heading error
+    # The larger the noise variance of a flight part, the more its estimate is moved to the mean
+    # heading error
     weight_of_part_estimate = heading_drift_variance_rad2 / (
         heading_drift_variance_rad2 + heading_variance_rad2
     )
     misalignment_rad = float(np.angle(np.exp(1j * misalignment_rad)))
-    # Rows: start, end, heading error, σ
+    # One row for each flight part: start, end, heading error, σ
     heading_part_fields = np.column_stack(
         [
             spans_s[is_part_long_enough],
@@ -343,8 +346,9 @@ def _fit_heading_errors(
 ) -> tuple[NoiseParameters, Array, Array]:
     """Fit the noises; return them, and heading error (rad) and variance (rad²) of each segment."""
     positions_and_increments = motion.make_positions_at_offset(0.0)
-    # Effect of a heading error: motion along the smooth path through the positions (last row),
-    # rotated by 90°. With the noisy motion from the IMU, the estimate would be too small
+    # Derivative of the motion with respect to the heading error: motion along the smooth path (last
+    # input of the fit), rotated by 90°. With the motion from the IMU, which is noisy, the estimated
+    # heading error would be too small
     for increments in (
         positions_and_increments.delta_position_m,
         positions_and_increments.delta_velocity_m_s,
@@ -362,8 +366,9 @@ def _fit_heading_errors(
     )
     constant_errors = position_fit.estimate_constant_errors_by_segment()[:, 0]
     covariance = np.linalg.inv(position_fit.compute_constant_error_information())[:, 0]
-    # The smooth path has the scale of the measured positions, but a heading error rotates true
-    # distances: divide the fitted heading error by the ratio of true to measured distances
+    # The smooth path, and with it the derivative above, has the scale of the measured positions.
+    # But a heading error rotates the true motion: divide the fitted heading error by the ratio of
+    # true to measured distances
     true_to_measured_scale = np.maximum(1.0 - constant_errors[:, -1], MIN_TRUE_TO_MEASURED_SCALE)
     return (
         noise_parameters,

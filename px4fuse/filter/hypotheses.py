@@ -47,8 +47,8 @@ MAX_SLOW_ERROR_KNOTS = 40
 # source frame relative to the attitude
 FORWARD_BIAS_COLUMN, RIGHT_BIAS_COLUMN, FRAME_ROTATION_COLUMN = range(3)
 CONSTANT_ERROR_COLUMN_COUNT = 3
-# Number of inputs for which KF's innovations are computed, for each axis: the flight data, and each
-# of the three constant errors with size 1
+# KF is run on several inputs for each axis: the flight data, and the effects of the three constant
+# errors (1 m/s² forward bias, 1 m/s² right bias, 1 rad yaw). Number of inputs for each axis
 INPUTS_PER_AXIS = 1 + CONSTANT_ERROR_COLUMN_COUNT
 # Tested values of SIGMA_A ÷ KF's SIGMA_A. Most are below 1, because KF's SIGMA_A includes biases
 # and tilt errors, which this regression estimates separately
@@ -58,11 +58,13 @@ TESTED_SCALE_FACTORS = np.linspace(0.7, 1.3, 7)
 MAX_TESTED_JUMP_TIMES = 800
 # Number of jump times that are tested at once, to limit the memory
 JUMP_BATCH_SIZE = 80
-# Positions within this time (s) after a tested jump are ignored, because they may be outliers
+# In a test for a jump, positions within this time (s) after the jump are omitted, because they may
+# be outliers
 OUTLIER_BURST_DURATION_S = 1.0
-# Outliers within this time (s) after a jump are tested again: they may be correct positions
+# Positions that seem to be outliers within this time (s) after a detected jump are tested again:
+# they may be correct
 OUTLIER_RETEST_DURATION_AFTER_JUMP_S = 6.0
-# Maximum false alarm probability of a jump, per flight
+# Maximum false alarm probability of a jump of the positions, per flight
 MAX_JUMP_FALSE_ALARM_P = 1e-3
 # Probability that a good measurement near a jump is classified as an outlier
 MAX_FALSE_OUTLIER_PROBABILITY = 1e-3
@@ -150,7 +152,8 @@ def estimate_mean_acceleration_error(axis: Axis) -> float | None:
     velocity_m_s = acceleration.compute_velocity_change_m_s(axis.direction)
     path_m = integrate_cumulatively(velocity_m_s, acceleration.time_s)
     residuals_m = axis.measurement_m - np.interp(time_s, acceleration.time_s, path_m)
-    # the doubly integrated acceleration is too large by error · t² / 2
+    # A constant acceleration error changes the doubly integrated acceleration by error · t² / 2, so
+    # the residuals contain -error · t² / 2
     return -2.0 * float(np.polynomial.Polynomial.fit(time_s, residuals_m, 2).convert().coef[2])
 
 
@@ -283,8 +286,9 @@ def _find_jumps(
     ]
 
     def mask_outliers_near_jump(jump_time_s: float) -> BoolArray:
-        # Omit the positions just after a jump, because they may be a burst of outliers. But
-        # positions after a reset that the source reports are valid, even if they are in the mask
+        # Omit the positions just after a tested jump, because they may be a burst of outliers.
+        # Positions after a reset that the source reports are valid: use them, even if is_skipped
+        # contains them
         if jump_time_s in source_reset_times_s:
             return is_skipped & ~_is_in_window(
                 time_s, jump_time_s, OUTLIER_RETEST_DURATION_AFTER_JUMP_S
@@ -295,8 +299,8 @@ def _find_jumps(
         outlier_run_starts_s = time_s[
             np.flatnonzero(is_skipped & ~np.append(False, is_skipped[:-1]))
         ]
-        # After a jump, all positions may seem to be outliers, so it may be at the start of a run of
-        # outliers. Of all other times, test only the best
+        # After a jump, all positions may seem to be outliers: test each start of a run of outliers.
+        # Of all measurement times, test only the most significant one
         candidate_times_s = [
             *source_reset_times_s,
             *_find_significant_jump_times(design_matrix, fit, is_skipped, outlier_run_starts_s),
@@ -405,8 +409,8 @@ def _locate_jump(
         fit, _ = design_matrix.fit_with_jump(jump_time_s, is_skipped | is_near_jump)
         return fit.compute_residual_squares() > max_residual_square
 
-    # First test the measurements after the jump: without the jump, correct ones seemed to be
-    # outliers. Then test each time near the jump, with the measurements near it
+    # First test the measurements after the jump: in the fit without the jump, correct measurements
+    # seemed to be outliers. Then test the measurements near the jump, for each possible jump time
     is_skipped = np.where(is_after_jump, test_for_outliers(jump.time_s), is_skipped)
     candidate_times_s = time_s[is_near_jump]
     is_skipped_away_from_jump = is_skipped & ~is_near_jump
@@ -611,8 +615,8 @@ class DesignMatrix:
         """
         inputs, axis_count = self.preintegrated_inputs, self.axis_count
         input_count = inputs.measurement_m.shape[1]
-        # Only inputs with measured acceleration are multiplied by the scale factor: for each axis,
-        # the flight data (first input of the axis) and the rotation
+        # The scale factor multiplies the inputs of KF that contain measured acceleration. For each
+        # axis, these are the flight data (first input of the axis) and the effect of a yaw rotation
         input_scale_factors = np.ones(input_count)
         acceleration_input_indices = INPUTS_PER_AXIS * np.arange(axis_count)
         input_scale_factors[acceleration_input_indices] = scale
@@ -625,7 +629,8 @@ class DesignMatrix:
             np.hstack([inputs.measurement_m, unit_steps]),
             gains,
         )
-        # Inputs: those of each axis, then the slow errors, then the jumps
+        # Order of KF's inputs: flight data and constant errors of each axis, slow acceleration
+        # errors, jumps
         *responses_by_axis, slow_error_responses, jump_responses = np.split(
             responses, [*(acceleration_input_indices + INPUTS_PER_AXIS), input_count], axis=1
         )
@@ -673,7 +678,8 @@ def make_design_matrix(
         )
 
     velocity_errors_per_unit_bias_and_yaw = _integrate_unit_errors(attitude, acceleration)
-    # Δp (m) and Δv (m/s) between the measurements, for each input of KF
+    # Δp (m) and Δv (m/s) between the measurements, for each input of KF: flight data and constant
+    # errors of each axis, then slow acceleration errors
     increments: list[ArrayPair] = []
     for axis, preintegrated_motion in zip(axes, preintegrated_motions, strict=True):
         increments.append(
@@ -683,7 +689,8 @@ def make_design_matrix(
             integrate_between_measurements(velocity_error_m_s @ axis.direction, error_time_s)
             for error_time_s, velocity_error_m_s in velocity_errors_per_unit_bias_and_yaw
         ]
-    # The slow acceleration error is linear between knots; the grid has 20 samples per interval
+    # The slow acceleration error is linear between knots; its time grid has 20 steps from knot to
+    # knot
     slow_error_knot_interval_count = int(
         np.clip(
             np.ceil((time_s[-1] - time_s[0]) / SLOW_ERROR_KNOT_SPACING_S), 1, MAX_SLOW_ERROR_KNOTS
@@ -699,7 +706,7 @@ def make_design_matrix(
             )
         )
     dp, dv = np.transpose(increments, (1, 2, 0))
-    # Only the flight data, the first input of each axis, contain positions
+    # Only the flight data (first input of each axis) contain measured positions
     measured_m = np.zeros_like(dp)
     measured_m[:, : INPUTS_PER_AXIS * len(axes) : INPUTS_PER_AXIS] = np.transpose(
         [motion.measurement_m for motion in preintegrated_motions]

@@ -61,7 +61,8 @@ HEADING_SIGMA_RAD = 0.05
 # Prior σ of the constant errors of a segment: initial attitude (rad), gyro bias (rad/s) and
 # accelerometer bias (m/s²) along three axes, and position scale (1)
 PRIOR_SIGMAS_OF_CONSTANT_ERRORS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
-# A gyro bias above this limit (rad/s; 5 σ of the prior) is subtracted before the fit
+# A gyro bias above this limit (rad/s; 5 σ of the prior) is subtracted from the gyro data before the
+# constant errors are fitted to the positions
 MAX_PRIOR_GYRO_BIAS_RAD_S = 0.02
 # Maximum gyro bias (rad/s) that EKF2 can remove from its attitude: the maximum of EKF2_GYR_B_LIM
 MAX_REMOVED_GYRO_BIAS_RAD_S = 0.4
@@ -186,7 +187,9 @@ class PositionsAndImuMotion:
         )
         prior_precision = np.zeros((len(self.time_s), 2))
         prior_precision[self.segment_edges[:-1]] = INITIAL_STATE_PRIOR_PRECISIONS
-        # The data, nine constant errors of attitude and IMU, and the scale factor error
+        # Columns: increment of the motion from the IMU, its derivatives with respect to nine
+        # constant errors of attitude and IMU, and its derivative with respect to the scale factor
+        # error
         column_count = 1 + len(PRIOR_SIGMAS_OF_CONSTANT_ERRORS)
         dp, dv = np.zeros(
             (2, len(self.directions), len(time_offsets_s), column_count, len(interval_s))

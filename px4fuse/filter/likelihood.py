@@ -29,10 +29,11 @@ from .steps import PredictionSteps, make_prediction_steps
 
 # Log-likelihood decrease (nats) at the ends of a 95 % interval: half the 95 % point of χ²(1)
 MAX_LOG_LIKELIHOOD_DROP = float(chdtri(1, 0.05)) / 2.0
-# Initial step of ln σ in the search for an end of the 95 % interval
+# Search for an end of the 95 % interval of SIGMA_A or SIGMA_Z: initial step of ln SIGMA_A or ln
+# SIGMA_Z
 INITIAL_LOG_SIGMA_SEARCH_STEP = 0.05
-# For each tested SIGMA_A, the most likely SIGMA_Z is searched, or vice versa. In this search, ln σ
-# changes at most by this value from the result for the previous tested SIGMA_A (or SIGMA_Z)
+# For each tested SIGMA_A, the most likely SIGMA_Z is searched, or vice versa. In this search, ln
+# SIGMA_Z changes at most by this value from the result for the previous tested SIGMA_A
 MAX_OTHER_NOISE_LOG_SIGMA_CHANGE = 1.0
 # Tolerance of ln σ in the search for the most likely SIGMA_Z for a given SIGMA_A, or vice versa
 OTHER_NOISE_LOG_SIGMA_TOLERANCE = 2e-3
@@ -111,7 +112,8 @@ def integrate_acceleration(
     """
     step_s = np.diff(prediction_steps.time_s)
     zeros = np.zeros(len(step_s))
-    # The velocity change of a step moves the vehicle until the end of the interval
+    # The velocity change in a prediction step moves the vehicle until the end of the interval
+    # between two measurements
     dp, dv = propagate_state(zeros, zeros, acceleration_m_s2, step_s)
     dp, dv = propagate_state(dp, dv, zeros, prediction_steps.compute_time_to_interval_end_s())
     dp, dv = (
@@ -192,7 +194,8 @@ def compute_innovations_with_gains(
     right_hand_side[..., 1] = preintegrated_motion.delta_velocity_m_s.T
     right_hand_side[..., 1:, 0] += predicted_position_gain * measured_m[..., :-1]
     right_hand_side[..., 1:, 1] += velocity_gain[:-1] * measured_m[..., :-1]
-    # Coefficients below the unit diagonal: unknown (p or v of each measurement), then distance
+    # Coefficients below the unit diagonal of the equations. Indices: measurement, column of p (0)
+    # or v (1), distance below the diagonal
     bands = np.zeros((len(position_gain), 2, 4))
     bands[:-1, 1, 1] = -dt
     bands[:-1, 0, 2] = predicted_position_gain - 1.0
@@ -269,11 +272,12 @@ def find_profile_likelihood_interval(
     def find_interval_end(direction: float, search_limit: float) -> float | None:
         other_log_sigma = best_log_sigmas[1]
 
-        # The interval ends where this function is zero. √(decrease of the log-likelihood) is nearly
-        # linear in ln σ, so brentq needs few steps
+        # The 95 % interval ends where this function is zero: √(decrease of the log-likelihood)
+        # minus its limit. This square root is nearly linear in ln σ, so brentq needs few steps
         @cache
         def compute_log_likelihood_drop_excess(log_sigma_change: float) -> float:
-            # The search for the other parameter starts at the result for the previous change
+            # The search for the second parameter starts at its result for the previous value of the
+            # first parameter
             nonlocal other_log_sigma
             if log_sigma_change == 0.0:
                 return -max_sqrt_log_likelihood_drop
@@ -294,7 +298,8 @@ def find_profile_likelihood_interval(
             )
 
         max_log_sigma_change = direction * (float(np.log(search_limit)) - best_log_sigmas[0])
-        # Increase the change until the decrease is too large: the end is before this change
+        # Increase the change of ln σ until the log-likelihood has decreased too much: the interval
+        # ends before this change
         tried_log_sigma_change = min(INITIAL_LOG_SIGMA_SEARCH_STEP, max_log_sigma_change)
         while compute_log_likelihood_drop_excess(tried_log_sigma_change) < 0.0:
             if tried_log_sigma_change == max_log_sigma_change:

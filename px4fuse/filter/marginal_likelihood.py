@@ -135,12 +135,13 @@ class PositionsAndIncrements:
                 has_too_few_measurements, np.diff([*self.segment_start_indices, len(is_measured)])
             )
             measurement_and_prior_precision[:, 0] += np.where(is_used, 1.0 / variance_m2, 0.0)
-            # Any precision of its initial state makes its equations regular, without other effect
+            # Give the initial state of this segment any precision, so that its equations are
+            # regular. The value has no other effect
             measurement_and_prior_precision[
                 self.segment_start_indices[has_too_few_measurements]
             ] += 1.0
-            # A measured state, or an initial state with a strong prior, adds a degree of freedom.
-            # Two of them per segment determine its initial position and velocity
+            # Degrees of freedom: number of measured states and of initial states with a strong
+            # prior, minus two for each segment, which determine its initial position and velocity
             is_known = (measurement_and_prior_precision > 0.0) & (
                 (measurement_and_prior_precision > self.prior_precision)
                 | (self.prior_precision > MIN_PRECISION_OF_KNOWN_STATE)
@@ -211,8 +212,8 @@ class PositionFit:
         is omitted.
         """
         scaled_gram_matrix = self.gram_matrix / sigma_factors[:, None, None, None, None] ** 2
-        # Row and column 0: the data. Other rows and columns: the constant errors, which are
-        # estimated in units of their prior σ
+        # Gram matrix: row and column 0 belong to the data (positions, IMU increments). The others
+        # belong to the constant errors, which are estimated in units of their prior σ
         prior_sigmas = self.prior_sigmas_of_constant_errors
         normalised_information_matrix = scaled_gram_matrix[..., 1:, 1:] * np.outer(
             prior_sigmas, prior_sigmas
@@ -279,8 +280,9 @@ def fit_positions(
             whitened_explained_part = system.whiten_explained_part(
                 measured_axis_m, *weighted_increments
             )
-            # Inner product of two inputs: ΔᵀQ⁻¹Δ of the increments Δ, plus zᵀR⁻¹z of the positions
-            # z (below), minus the part that the estimated states explain
+            # Inner product of two inputs of the regression: ΔᵀQ⁻¹Δ of the IMU increments Δ, plus
+            # zᵀR⁻¹z of the positions z (below), minus the part that the estimated positions and
+            # velocities explain
             for sign, left, right, values_per_measurement in (
                 (1.0, increments[0], weighted_increments[0], 1),
                 (1.0, increments[1], weighted_increments[1], 1),
@@ -333,15 +335,16 @@ def subtract_smooth_path(
         measured_m_by_axis = np.repeat(
             np.nan_to_num(measured_m[:, axes].T)[:, None], dp.shape[1], 1
         )
-        # Input 0 is the data, the last input is the scale factor error
+        # Input 0 is the data (positions, IMU increments), the last input is the derivative for the
+        # scale factor error
         smoothed_state = system.solve(measured_m_by_axis, dp[axes, :, 0], dv[axes, :, 0])
         smoothed_state[:, :, positions.segment_start_indices] = 0.0
         path_m = smoothed_state[..., 0]
         path_velocity_m_s = smoothed_state[..., 1]
         measured_m[:, axes] -= path_m[:, 0].T
         path_delta_position_m = np.diff(path_m) - positions.interval_s * path_velocity_m_s[..., :-1]
-        # The measured positions are the same for all tested time offsets. The path that is fitted
-        # with the first time offset is therefore subtracted for all of them
+        # All tested time offsets have the same measured positions, so the same path is subtracted
+        # for all of them: that of the first time offset
         for array, increment in ((dp, path_delta_position_m), (dv, np.diff(path_velocity_m_s))):
             array[axes, :, 0] -= increment[:, :1]
             if estimates_scale:
@@ -367,9 +370,10 @@ def estimate_squared_errors(
     constant_errors : ndarray, shape (segments, c)
         Estimated constant errors (such as biases).
     """
-    # Increments without constant errors: data + Σ constant error · derivative
+    # IMU increments, corrected for the estimated constant errors: data + Σ constant error ·
+    # derivative
     input_weights = np.insert(constant_errors, 0, 1.0, axis=1)
-    # An interval is in the segment of the measurement at its end
+    # The interval between two measurements belongs to the segment of the later measurement
     input_weights_by_interval = np.repeat(
         input_weights, np.diff([*positions.segment_start_indices, len(variance_m2)]), axis=0
     )[1:]
@@ -416,7 +420,8 @@ def compute_segment_inner_products(
     inner_products_by_batch = []
     for begin in range(0, right_factor_positions_m.shape[1], INNER_PRODUCTS_PER_BATCH):
         batch = np.s_[:, begin : begin + INNER_PRODUCTS_PER_BATCH]
-        # Inputs: each u, each v (without increments), and each constant error (without positions)
+        # Inputs of the regression: each u, each v with zero increments, and the derivative for each
+        # constant error with zero positions
         dp, dv = (
             np.concatenate(
                 [increment[batch], 0.0 * increment[batch], increment_per_constant_error], axis=1
@@ -526,7 +531,8 @@ class BandedNormalEquations:
         right_hand_side[..., 1:, 1] = weighted_dv
         right_hand_side[..., :-1, 0] -= weighted_dp
         right_hand_side[..., :-1, 1] -= self.interval_s * weighted_dp + weighted_dv
-        # Only the first inputs have positions. A position measures position + time-correlated noise
+        # Only the first inputs of the regression have positions. The measured quantity is the
+        # position plus the time-correlated noise, if it is fitted
         weighted_measurements = self.precision[:, 0] * measured_m
         right_hand_side_with_measurements = right_hand_side[..., : measured_m.shape[-2], :, :]
         right_hand_side_with_measurements[..., 0] += weighted_measurements
@@ -538,9 +544,10 @@ class BandedNormalEquations:
 
         The information of earlier and of later measurements is added (Fraser and Potter 1969).
         """
-        # At each measurement, the Cholesky factor of A contains the information of all earlier
-        # measurements. With A in reverse time order, it contains that of all later measurements
-        # Element (i + band, i) of A becomes element (n - 1 - i, n - 1 - i - band)
+        # Each diagonal block of the Cholesky factor of the normal equations A contains the
+        # information of all measurements up to its own. With A in reverse time order, it contains
+        # the information of all later measurements and its own. Element (i + band, i) of A becomes
+        # element (n - 1 - i, n - 1 - i - band)
         time_reversed_bands = np.zeros_like(self.bands)
         number_of_unknowns = self.bands.shape[1]
         for band in range(4):
@@ -557,7 +564,8 @@ class BandedNormalEquations:
         b = self.cholesky_factor[1, 0::2]
         (d, f) = (time_reversed_cholesky_factor[0, first_row::2][::-1] for first_row in (0, 1))
         e = time_reversed_cholesky_factor[1, 0::2][::-1]
-        # Sum of both information matrices LLᵀ, minus the diagonal block of A that is in both
+        # Information on the state from all measurements: sum of the information LLᵀ from earlier
+        # and from later measurements, minus the diagonal block of A, which both contain
         p00 = a**2 + e**2 + f**2 - self.bands[0, 0::2]
         p01 = a * b + d * e - self.bands[1, 0::2]
         p11 = b**2 + c**2 + d**2 - self.bands[0, 1::2]

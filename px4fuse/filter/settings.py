@@ -102,7 +102,8 @@ class Settings:
 def requested_settings(request: ComparisonRequest) -> Settings:
     """Return the KF settings that the user requested; all others have default values."""
     values = {name: getattr(request, name) for name in Settings.__dataclass_fields__}
-    # The time offset is estimated later, or added by the reader of a position file
+    # With auto, the time offset is estimated later. For a position file, read_flight adds it to the
+    # timestamps
     if request.clock_offset_s == AUTO or request.position is not None:
         del values["clock_offset_s"]
     return Settings(**{name: value for name, value in values.items() if value is not None})

@@ -35,7 +35,7 @@ from px4fuse.trajectory.rotation import interpolate, rotate, to_rotation_matrix
 
 # Name of the axis along the main horizontal direction of the flight
 AISLE_AXIS = "aisle"
-# Note of this axis if the user gives its heading
+# Note of the axis along the main direction if the user gives its heading
 HEADING_NOTE = "heading chosen with --heading"
 # Minimum length (s) of an IMU gap
 MIN_IMU_GAP_S = 0.1
@@ -347,7 +347,8 @@ def integrate_ned_acceleration(
         )
     is_gap = find_imu_gaps(time_s)
     gap_rows = np.flatnonzero(is_gap)
-    # The sum of gap times is linear between the edges of the gaps, so these times are sufficient
+    # Between the edges of the IMU gaps, cumulative_gap_s is linear, so only its values at the edges
+    # are stored
     cumulative_gap_s = np.cumsum(np.where(is_gap, np.diff(time_s), 0.0))
     gap_edge_rows = np.unique([0, *gap_rows, *(gap_rows + 1), len(time_s) - 1])
     return Acceleration(

@@ -39,8 +39,8 @@ from .signals import Segment, cut_to_segment, make_downsampling_slice
 
 # Half-width (s) of the range of time offsets that is tested around the result of the coarse search
 INITIAL_SEARCH_HALF_WIDTH_S = 0.1
-# The likelihood curve covers the estimated time offset ± this multiple of its σ, and at least
-# ± this time (s)
+# The likelihood curve shows the likelihood of the positions over the time offset. It covers the
+# estimated time offset ± this multiple of its σ, and at least ± this time (s)
 LIKELIHOOD_CURVE_HALF_WIDTH_SIGMAS, MIN_LIKELIHOOD_CURVE_HALF_WIDTH_S = 3.5, 0.01
 # Width of the range of tested time offsets ÷ width of the likelihood curve. The curve is centred at
 # the maximum-likelihood estimate, which is not exactly in the middle of this range
@@ -49,7 +49,7 @@ TESTED_TO_CURVE_WIDTH_RATIO = 1.3
 FINE_GRID_OFFSET_COUNT = 11
 # Maximum step (s) of the tested time offsets for an interpolation of the likelihood
 MAX_INTERPOLATED_OFFSET_STEP_S = 0.05
-# Number of points of the likelihood curve in the report
+# Number of time offsets for which the report shows the likelihood of the positions
 LIKELIHOOD_CURVE_POINT_COUNT = 121
 # Prior σ (rad) of EKF2's heading with GNSS: a wrong GNSS delay (0.2 s) causes an error of 5°
 GNSS_HEADING_SIGMA_RAD = 0.2
@@ -64,7 +64,8 @@ MAX_OFFSET_INTERVAL_HALF_WIDTH_S = 0.15
 MAX_SEGMENT_OFFSET_SIGMA_S = 0.15
 # The time offset changes in flight if the p-value of a constant offset is below this limit
 MAX_P_VALUE_OF_CHANGED_OFFSET = 0.005
-# Minimum change (s) of the time offset in flight: a smaller change may be drift of the source
+# Minimum change (s) of the time offset between source and IMU in flight: a smaller change may be
+# drift of the source
 MIN_TIME_OFFSET_CHANGE_S = 0.10
 # Minimum ratio of a significant time offset to its σ
 MIN_OFFSET_SIGMAS = 3.0
@@ -217,7 +218,8 @@ def estimate_time_offset(
         MAX_LOG_LIKELIHOOD_DROP * offset_variance_factor,
     )
     offset_s = _fit_minimum_and_sigma(curve.offsets_s, curve.scores)[0]
-    # IMU samples are averages, so the timing error (half a sample interval, 1 σ) is added
+    # An IMU sample is an average over its interval, so its time has an error of half an interval (1
+    # σ). The 95 % interval of the time offset is widened by this error
     resolution_s = 0.5 * imu_motion.imu_interval_s
     interval_low_s, interval_high_s = curve.widen_interval(offset_s, 1.96 * resolution_s)
     rejection_reason = ""
@@ -295,8 +297,8 @@ def _compute_offset_likelihood_curve(
     """
     while True:
         offsets_s = _make_offset_grid(offset_s, half_width_s, LIKELIHOOD_CURVE_POINT_COUNT)
-        # Compute -ln p at other time offsets if the known values cannot be interpolated: the curve
-        # is wider, or the steps are too large
+        # Test other time offsets if the curve extends beyond the tested ones, or if their steps are
+        # too large for an interpolation of -ln p
         if (
             offsets_s[0] < tested_offsets_s[0]
             or offsets_s[-1] > tested_offsets_s[-1]
@@ -435,8 +437,9 @@ def _estimate_flight_part_offsets(
             score_excesses.append(scores - scores.min())
     if len(part_offsets) < 2:
         return tuple(part_offsets), None
-    # Log-likelihood ratio: one common time offset against separate time offsets. The terms are in
-    # nats without the effect of IMU noise
+    # Log-likelihood ratio: one common time offset against separate time offsets of the flight
+    # parts. The score excesses (nats) do not contain the effect of IMU noise: divide by its
+    # variance factor
     chi_square = 2.0 * float(np.sum(score_excesses, axis=0).min()) / offset_variance_factor
     return tuple(part_offsets), float(chdtrc(len(part_offsets) - 1, chi_square))
 

@@ -203,8 +203,8 @@ def tune(
                     name, group_axes, settings, flight, may_drift, motion_cache
                 )
             except np.linalg.LinAlgError as error:
-                # Outliers far from the path cause rounding errors, which can make the matrix
-                # singular
+                # Outliers far from the flight path cause rounding errors, which can make the matrix
+                # of the normal equations singular
                 tunings[name] = Unavailable(
                     f"estimate of SIGMA_A and SIGMA_Z ({name})",
                     str(error),
