@@ -36,7 +36,8 @@ def to_z_down(trajectory: Trajectory) -> Trajectory:
     if trajectory.frame not in _Z_DOWN_CONVERSIONS:
         return trajectory
     axes, z_down_frame, note = _Z_DOWN_CONVERSIONS[trajectory.frame]
-    # Only trajectories of flight logs have variances, and their z is down
+    # _rotate does not convert variances: only trajectories of flight logs have variances, and their
+    # z is already down
     rotated = _rotate(trajectory, _matrix_to_ned(axes), z_down_frame)
     return replace(rotated, notes=(*trajectory.notes, note))
 

@@ -33,11 +33,14 @@ from .model import (
     TrueFinalPose,
 )
 
-# Minimum growth of the reported variances along the path; otherwise they are not used
+# Reported position or orientation variances of odometry are used only if they grow along the path:
+# minimum ratio of their median at the end to their median at the start
 MIN_VARIANCE_GROWTH_RATIO = 2.0
-# Minimum ratio of a reported variance to the default variance, against a division by 0
+# Minimum ratio of the variance of an odometry edge from reported variances to its default variance,
+# against a division by 0
 MIN_REPORTED_TO_DEFAULT_VARIANCE_RATIO = 1e-2
-# Fraction of the poses that counts as start or end of the path, for median variances
+# Fraction of the poses at each end of the path from which the median of the reported variances is
+# computed
 FRACTION_OF_POSES_AT_EACH_END = 0.1
 
 
@@ -153,7 +156,7 @@ def build_pose_graph(
             key_frame_indices,
             "",
         )
-    # Nodes: key frames, and the poses at both ends of each closure
+    # Nodes of the pose graph: key frames, and the poses at both ends of each loop closure
     closure_times_s = np.array(
         [(closure.time_1_s, closure.time_2_s) for closure in closures]
     ).reshape(-1, 2)
@@ -165,7 +168,7 @@ def build_pose_graph(
     translation_variance_m2, rotation_variance_rad2, variance_note = compute_odometry_variances(
         path, node_indices, noise
     )
-    # Edges: odometry between successive nodes, then closures
+    # Edges of the pose graph: odometry between successive nodes, then loop closures
     step_indices = np.arange(len(node_indices) - 1)
     first_nodes = np.append(step_indices, closure_nodes[:, 0])
     second_nodes = np.append(step_indices + 1, closure_nodes[:, 1])
@@ -179,7 +182,8 @@ def build_pose_graph(
     measured_translation_m = first_rotation_inverse.apply(
         node_position_m[second_nodes] - node_position_m[first_nodes]
     )
-    # A closure states that both poses have the same position; orientations have no information
+    # A loop closure states that its two poses have the same position; it gives no information on
+    # their orientations
     landing_edge_index = len(step_indices)
     for edge_index, closure in enumerate(closures, start=landing_edge_index):
         measured_translation_m[edge_index] = 0.0
@@ -189,7 +193,8 @@ def build_pose_graph(
             landing_edge_index
         ].apply(true_end.displacement_vector_m)
         if true_end.heading_change_deg is not None:
-            # Rotate the final node about the vertical, so that the edge has the true heading change
+            # Rotate the measured final orientation about the vertical, so that the edge from the
+            # first to the final pose has the true heading change
             odometry_heading_change_rad = compute_heading_change_rad(
                 second_node_rotation[landing_edge_index]
                 * node_rotation[first_nodes[landing_edge_index]].inv()
@@ -201,7 +206,8 @@ def build_pose_graph(
                 Rotation.from_rotvec(heading_correction_rad * DOWN_DIRECTION)
                 * second_node_rotation[landing_edge_index]
             )
-            # Only the rotation about the vertical is known; its axis in the frame of the final pose
+            # The true final pose determines only the rotation about the vertical. The edge needs
+            # this axis in the frame of the final pose
             vertical_direction = (
                 second_node_rotation[landing_edge_index].inv().apply(DOWN_DIRECTION)
             )
@@ -232,7 +238,8 @@ CORRECTION_LABELS: Mapping[CorrectionName, str] = {
     "pose_graph_gated": "pose graph with accepted loop closures",
     "pose_graph_gnc": ROBUST_SOLUTION_LABEL,
 }
-# Corrected path with its pose graph solution, if any, or the reason why it is missing
+# Corrected path, and its pose graph solution (None without a pose graph). If there is no corrected
+# path: the reason
 CorrectionOutcome = tuple[Trajectory, Solution | None] | Unavailable
 
 
@@ -369,7 +376,8 @@ def _correct_path(
         Rotation.from_quat(solved_poses[:, 3:]) * Rotation.from_quat(graph_poses[:, 3:]).inv()
     )
     time_s, node_time_s = path.time_s, path.time_s[node_indices]
-    # The first and the last pose of the path are nodes; the last pose is after the node before last
+    # Number of the node before each pose. The first and the last pose of the path are nodes. The
+    # last pose gets the last node but one, so that each pose also has a next node
     previous_nodes = np.searchsorted(node_time_s[1:-1], time_s, side="right")
     node_number = np.interp(time_s, node_time_s, np.arange(len(node_time_s)))
     next_node_weight = node_number - previous_nodes

@@ -23,7 +23,8 @@ from .model import TrueFinalPose
 REST_DURATION_S = 1.0
 # Maximum extent (m) of the positions of a vehicle at rest
 MAX_POSITION_EXTENT_AT_REST_M = 0.15
-# Maximum heading change (°) of odometry for the assumption that the true change is zero
+# If odometry measures at most this heading change (°) from take-off to landing, the true heading
+# change is assumed to be zero
 MAX_HEADING_CHANGE_ASSUMED_ZERO_DEG = 15.0
 
 

@@ -74,9 +74,9 @@ class OdometryNoise(Record, omit_defaults=False):
     Sources of the defaults: Delmerico and Scaramuzza 2018; Intel's data sheet of the T265.
     """
 
-    # σ (m) of the position per axis after 100 m, without heading errors
+    # σ (m) of the position drift per axis after a path of 100 m, without heading errors
     position_m: NonNegativeFloat = 1.0
-    # σ (°) of the heading after 100 m
+    # σ (°) of the heading drift after a path of 100 m
     heading_deg: NonNegativeFloat = 3.0
     # Drift of position (m/√s) and heading (°/√s) over time
     position_m_per_root_s: NonNegativeFloat = 0.01
@@ -97,12 +97,13 @@ class LoopClosure(Record, kw_only=True):
     source: str
     # Closure error (m) of odometry
     distance_m: NonNegativeFloat
-    # χ² test: squared Mahalanobis distance, degrees of freedom, p value, and acceptance
+    # χ² test of the loop closure error: squared Mahalanobis distance, degrees of freedom, p value,
+    # and acceptance
     d2: NonNegativeFloat
     degrees_of_freedom: Count
     p: Share
     accepted: bool
-    # Weight in robust optimisation, from 0 to 1
+    # Weight of the loop closure in robust optimisation (GNC), from 0 to 1
     weight_gnc: float | None = None
 
     def __str__(self) -> str:
@@ -191,8 +192,8 @@ class Loop(Record, kw_only=True):
         """Return the paths without duplicates."""
         paths = self.find_paths()
         if isinstance(self.heading_error_deg, Unavailable):
-            # Without a known heading error, "by_distance" corrects positions only, like
-            # "by_distance_plain"
+            # If the heading error is unknown, the path "by_distance" has only corrected positions,
+            # so it equals "by_distance_plain"
             paths.pop("by_distance", None)
         return tuple(paths.values())
 

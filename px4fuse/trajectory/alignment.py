@@ -157,7 +157,8 @@ def _require_sufficient_motion(
     reference_extents_m = _compute_principal_extents_m(reference_m)
     residuals_m = reference_m - transform.apply(estimate_m)
     if kind == "yaw":
-        # Horizontal motion determines yaw: compare with the whole motion
+        # Horizontal motion determines the yaw: its extent must not be negligible relative to the
+        # extent of the whole motion
         extent_m = min(
             float(np.linalg.norm(position_m[:, :2].std(axis=0)))
             for position_m in (estimate_m, reference_m)

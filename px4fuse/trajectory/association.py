@@ -92,7 +92,8 @@ def associate(
     reference_start_s, reference_end_s = reference.time_s[[0, -1]]
     margin_s = 0.0
     if method == "nearest":
-        # Poses just before or after the reference can have a pair
+        # Poses just before the start or just after the end of the reference can be paired with its
+        # first or last pose
         margin_s = max_gap_s
         pose_indices, reference_indices = _pair_nearest(
             estimate.time_s, reference.time_s, max_gap_s, time_offset_s

@@ -47,12 +47,15 @@ from .time_offset import TimeOffset, compute_clock_offset_s, estimate_time_offse
 MAX_ROTATION_OF_CONSTANT_ORIENTATION_RAD = 1e-6
 # Minimum number of poses and minimum extent (m) for the search for a constant orientation
 MIN_POSE_COUNT_TO_TEST_CONSTANT_ORIENTATION, MIN_EXTENT_TO_TEST_CONSTANT_ORIENTATION_M = 10, 1.0
-# Minimum duration (s) of a repeated position, and minimum motion (m) of the reference meanwhile
+# Frozen positions of the estimate: minimum duration (s) of a repeated position, and minimum motion
+# (m) of the reference meanwhile
 MIN_FREEZE_DURATION_S, MIN_REFERENCE_MOTION_DURING_FREEZE_M = 2.0, 0.5
-# Minimum jump (m) relative to the reference, and its minimum ratio to the median step error
+# Jumps of the estimate: minimum difference (m) between the steps of estimate and reference from
+# pose to pose, and its minimum ratio to the median difference of all steps
 MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_STEP_ERROR_RATIO = 0.5, 20.0
 MAX_STATED_JUMPS = 5
-# Minimum rotation (rad) between the orientations of two trajectories with different body axes
+# Minimum constant rotation (rad) between the orientations of two trajectories, if their body axes
+# differ
 MIN_ROTATION_BETWEEN_BODY_AXES_RAD = np.radians(30.0)
 # Maximum variation (rad, RMS) of a rotation that counts as constant
 MAX_DEVIATION_FROM_MEAN_ROTATION_RAD = np.radians(5.0)
@@ -287,7 +290,8 @@ def evaluate(
     aligned_estimate, notes = _rotate_to_reference_body(
         _apply_transform(transform, matched_estimate), matched_reference
     )
-    # A constant rotation between other body axes also needs the lever arm between both origins
+    # If the body axes differ by another constant rotation (not between camera and vehicle), also
+    # estimate the lever arm between the origins of both bodies
     if not notes and has_other_body_axes(aligned_estimate, matched_reference):
         matched_estimate, notes = _move_to_reference_body(
             matched_estimate, matched_reference, alignment
@@ -308,7 +312,8 @@ def evaluate(
     )
     position_statistics = compute_statistics(position_error_m)
     if better_offset_s is not None:
-        # With the better time offset, too few poses may match, or they do not move
+        # With better_offset_s, too few poses may match in time, or the matched poses may not move:
+        # then no warning
         with suppress(TrajectoryError):
             better_evaluation = evaluate(
                 estimate,
@@ -452,7 +457,7 @@ def _choose_time_offset(
         fallback = TimeOffset(offset_s=added_offset_s, is_determinable=False, reason=reason)
         return fallback, [f"{reason} {match_text}"], None
     time_offset = TimeOffset(offset_s=added_offset_s, is_determinable=True, reason=match_text)
-    # Without an estimate, no other offset is better
+    # If no time offset can be estimated, the added offset counts as the best
     low_s, high_s = estimated_offset.interval_s or (added_offset_s, added_offset_s)
     best_offset_s = estimated_offset.offset_s or added_offset_s
     has_better_offset = (

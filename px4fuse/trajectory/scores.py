@@ -25,9 +25,11 @@ DEFAULT_RPE_DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
 DEFAULT_RPE_TIMES_S = (1.0, 10.0, 60.0)
 MAX_DEFAULT_RPE_DISTANCES = 3
 MAX_DEFAULT_RPE_TIMES = 2
-# Minimum default RPE distance, as fraction of the path length
+# Minimum default path length between the two poses of an RPE pair, as fraction of the whole path
+# length
 MIN_PAIR_DISTANCE_FRACTION_OF_PATH = 1 / 200
-# Maximum default RPE distance or time, as fraction of path length or duration
+# Maximum default path length (or time) between the two poses of an RPE pair, as fraction of the
+# whole path length (or duration)
 MAX_PAIR_DISTANCE_FRACTION = 1 / 5
 BOOTSTRAP_RESAMPLES = 2000
 BOOTSTRAP_SEED = 20120101
@@ -195,7 +197,8 @@ def find_pose_pairs(
     candidates = distance_or_time[candidate_indices]
     pair_distance_error = np.abs(candidates - distance_or_time[start_indices, None] - delta.value)
     best_columns = np.argmin(pair_distance_error, axis=1)
-    # Several poses have an equal distance while the vehicle is at rest: use the first
+    # While the vehicle is at rest, several poses have the same path length from the start: use the
+    # first of them
     end_indices = np.searchsorted(distance_or_time, candidates[start_indices, best_columns])
     end_indices = np.maximum(end_indices, start_indices + 1)
     min_error = pair_distance_error[start_indices, best_columns]
@@ -264,8 +267,8 @@ def compute_relative_pose_error(
             relative_rotations.append(start_rotation_inverse * rotation[end_indices])
         estimated_rotation, reference_rotation = relative_rotations
         rotation_deg = compute_rotation_statistics(reference_rotation, estimated_rotation)
-    # The difference between both displacements is as long as the translation of the pose error E of
-    # the pair: a rotation does not change the length
+    # Error of the displacement between the two poses: estimate minus reference. It is as long as
+    # the translation of the pose error E, because a rotation does not change the length
     translation_m = np.linalg.norm(displacements_m[0] - displacements_m[1], axis=1)
     overlapping_pair_count = int(np.median(end_indices - start_indices)) if all_pairs else 1
     rmse_interval_m = estimate_rmse_interval(

@@ -29,9 +29,11 @@ MIN_OVERLAP_FRACTION = 0.5
 # Minimum number of overlapping poses, as fraction of the number at complete overlap
 MIN_USED_POSES_FRACTION = 0.3
 MAX_CANDIDATE_OFFSETS = 12
-# Half-width (s) of the search around a correlation peak
+# Search for the time offset with the smallest ATE: half-width (s) of the first search, around a
+# peak of the speed correlation
 SEARCH_HALF_WIDTH_S = 0.5
-# Half-width (s) of the second, finer search
+# Search for the time offset with the smallest ATE: half-width (s) of the second search, around the
+# result of the first
 FINE_SEARCH_HALF_WIDTH_S = 0.1
 # Minimum distance (s) between two peaks of the speed correlation
 MIN_CORRELATION_PEAK_DISTANCE_S = 1.0
@@ -42,12 +44,15 @@ MIN_SECOND_BEST_RESIDUAL_RATIO = 1.2
 MAX_FITTED_POSES = 2000
 # Maximum residual (RMS) of an accepted fit, divided by the extent (RMS) of the motion
 MAX_RELATIVE_MISFIT = 0.5
-# Lower limit of residual divided by extent (RMS): better fits count as equally good
+# Lower limit of the residual ÷ extent of the motion (both RMS): below it, all fits count as equally
+# good
 MISFIT_FLOOR = 1e-3
-# Minimum ratio: RMS of the velocity without the effect of a wrong alignment ÷ RMS speed
+# A change of the alignment (shift, rotation, scale) can have the same effect as a time offset. The
+# velocity that it explains is removed. Minimum RMS of the remaining velocity ÷ RMS speed: below it,
+# the time offset is not determinable
 MIN_RESIDUAL_VELOCITY_FRACTION = 0.05
-# The effect of a wrong alignment (shift, rotation, scale) is subtracted from the velocities of both
-# trajectories. Minimum correlation between the remaining velocities
+# Minimum correlation between the remaining velocities of both trajectories, without the velocity
+# that a change of the alignment explains
 MIN_RESIDUAL_VELOCITY_CORRELATION = 0.5
 # Maximum lag in the variance estimate of Newey and West (1987) ÷ correlation length
 MAX_LAG_IN_CORRELATION_LENGTHS = 4
@@ -132,7 +137,8 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
     max_misfit = MIN_SECOND_BEST_RESIDUAL_RATIO * best_fit.compute_misfit()
     fits_similar_to_best = [fit for fit in accepted_fits if fit.compute_misfit() <= max_misfit]
     if clock_offset_s is not None:
-        # Of several equally good offsets, use the one nearest to the offset of the UNIX timestamps
+        # If several time offsets fit equally well, use the one nearest to the offset from the UNIX
+        # times of both trajectories
         best_fit = min(fits_similar_to_best, key=lambda fit: abs(fit.offset_s - clock_offset_s))
     else:
         for fit in fits_similar_to_best:
@@ -367,7 +373,8 @@ def _refine_offset(
     gap_limit_s = max(
         choose_gap_limit_s(dense_track.time_s), 0.5 * choose_gap_limit_s(sparse_time_s)
     )
-    # With the same poses at every offset, the cost is continuous
+    # Use only poses that overlap with the other trajectory at all tested time offsets. With the
+    # same poses, the sum of squared residuals is a continuous function of the offset
     is_known = [
         is_bracketed(sparse_time_s + (lag_s + shift), dense_track.time_s, gap_limit_s)
         for shift in (-half_width_s, 0.0, half_width_s)

@@ -78,7 +78,8 @@ def gate_edges(graph: model.PoseGraph, tested_edge_indices: IntArray) -> list[Ga
     odometry_chain_covariance = (
         cumulative_covariance[nodes.max(axis=0)] - cumulative_covariance[nodes.min(axis=0)]
     )
-    # Convert it to the axes of the second pose, then to the residual of the closure
+    # Convert the covariance of the odometry chain to the axes of the second pose, then to the
+    # closure residual (odometry relative to the measured relative pose)
     first_poses, second_poses = poses[nodes]
     covariance = _propagate_covariances(
         lie.adjoint(lie.inverse(second_poses)), odometry_chain_covariance

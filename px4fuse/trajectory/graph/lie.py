@@ -135,9 +135,10 @@ def right_jacobian_inverse(tangent: Array) -> Array:
     theta = np.linalg.norm(tangent[..., _get_dimension(tangent) :], axis=-1)[..., None, None]
     square_term_factor = _compute_square_term_factor(theta)
     half_derivative_over_theta = 0.5 * _compute_square_term_derivative_over_theta(theta)
-    # x / (1 - exp(-x)) for the Lie bracket matrix x = ad is 1 + x/2 + a x^2 + b x^4: the identity
-    # ad^5 = -2 theta^2 ad^3 - theta^4 ad replaces all higher powers. The sums of their factors are
-    # a = f - theta f'/2 and b = -f'/(2 theta), with the function f of _compute_square_term_factor
+    # With the Lie bracket matrix x = ad, the inverse right Jacobian is x / (1 - exp(-x)) = 1 + x/2
+    # + a x^2 + b x^4. Higher powers of x are not needed, because ad^5 = -2 theta^2 ad^3 - theta^4
+    # ad. The factors are a = f - theta f'/2 and b = -f'/(2 theta), with f =
+    # _compute_square_term_factor(theta)
     jacobian: Array = (
         np.eye(lie_bracket_matrix.shape[-1])
         + 0.5 * lie_bracket_matrix

@@ -40,7 +40,7 @@ class PoseGraph:
     measurements: Array
     # Inverse covariance of each measurement, translation before rotation
     information: Array
-    # Origin of the initial poses, a text
+    # Source of the initial poses, for example "chained odometry edges"
     initial_pose_origin: str = INITIAL_POSES_FROM_FILE
 
     __repr__ = one_line_repr
@@ -206,7 +206,8 @@ def _compute_chordal_poses(graph: PoseGraph) -> PoseGraph:
     require_connected(graph, rotation_information > 0.0, "edges that measure a rotation")
     measured_rotation = lie.rotation_matrix(graph.measurements)
     eye = np.broadcast_to(np.eye(dimension), measured_rotation.shape)
-    # Linear least squares for matrices R_i: minimise the weighted sum of |Zᵀ R_iᵀ - R_jᵀ|²
+    # Linear least squares for the rotation matrix R_i of each pose. With the measured rotation Z of
+    # each edge (i, j), minimise the weighted sum of |Zᵀ R_iᵀ - R_jᵀ|²
     transposed_matrices = _solve_positions(
         graph,
         first_pose_matrix=measured_rotation.transpose(0, 2, 1),

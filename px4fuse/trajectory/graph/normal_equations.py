@@ -22,18 +22,19 @@ _FIXED_POSE_INFORMATION = 1e100
 
 
 class _FrontalMatrix(NamedTuple):
-    """Dense matrix in which a group of poses is eliminated together (supernode)."""
+    """Dense matrix in which a group of poses is eliminated together (front, supernode)."""
 
-    # Range of the unknowns that are eliminated in this front, and indices of the other unknowns in
-    # their equations, which are eliminated later
+    # Range of the unknowns that this group eliminates, and indices of the other unknowns in their
+    # equations, which later groups eliminate
     unknowns: slice
     remaining_unknowns: IntArray
-    # Matrix blocks of the group, and their rows and columns (in poses) in this frontal matrix
+    # Stored blocks (one for each pair of poses) in the columns of the eliminated poses, and their
+    # row and column in this dense matrix, counted in blocks
     blocks: slice
     block_rows: IntArray
     block_columns: IntArray
-    # Index of the parent front in the elimination tree, and rows of ``remaining_unknowns`` in the
-    # matrix of the parent front
+    # Index of the parent, which is the group that eliminates the first of ``remaining_unknowns``,
+    # and rows of ``remaining_unknowns`` in the dense matrix of the parent
     parent_index: int
     rows_in_parent: IntArray
 
@@ -76,7 +77,8 @@ class NormalEquations:
             first_pose, remaining_poses = poses[0], poses[eliminated_count:]
             eliminated_range = np.array([first_pose, first_pose + eliminated_count])
             front_blocks = slice(*np.searchsorted(block_columns, eliminated_range))
-            # The parent front eliminates the first of the remaining poses. The last front has none
+            # The parent of a group eliminates the first of its remaining poses. The last group has
+            # no remaining poses and no parent
             parent_index = int(front_by_pose[remaining_poses[0]]) if len(remaining_poses) else 0
             parent_rows = np.searchsorted(poses_by_front[parent_index], remaining_poses)
             self._fronts.append(
@@ -109,7 +111,9 @@ class NormalEquations:
         """
         pose_matrices = np.stack([first_pose_matrix, second_pose_matrix])
         weighted_matrices = pose_matrices.swapaxes(2, 3) @ information
-        # Blocks in the rows of the first pose, or transposed if the first pose is eliminated first
+        # Off-diagonal block of each edge: rows of the first pose, columns of the second pose.
+        # Transpose it if the first pose is eliminated first, because only blocks below the diagonal
+        # are stored
         off_diagonal_blocks = weighted_matrices[0] @ second_pose_matrix
         is_first_earlier = np.less(*self._position[self._edges])
         off_diagonal_blocks[is_first_earlier] = off_diagonal_blocks[is_first_earlier].swapaxes(1, 2)
@@ -206,7 +210,8 @@ def _find_elimination_order(
             and len(remaining_poses[pose]) == len(remaining_poses[parent]) + 1
         ):
             last_poses[pose] = last_poses[parent]
-    # In the order of their last poses, each front is eliminated before its parent
+    # The groups are eliminated in the order of their last poses. Each group is then eliminated
+    # before its parent, which eliminates the first of its remaining poses
     position = np.argsort(np.argsort(last_poses, kind="stable"))
     last_poses, eliminated_counts = np.unique(last_poses, return_counts=True)
     poses_by_front = [

@@ -42,10 +42,11 @@ _COST_TOLERANCE = 1e-10
 _GNC_STAGE_TOLERANCE = 1e-6
 _MAX_GNC_STAGE_ITERATIONS = 20
 
-# A closure with χ² below the quantile at this probability keeps full weight in graduated
-# non-convexity
+# In graduated non-convexity, a loop closure keeps full weight if its χ² is below the quantile at
+# this probability
 GNC_INLIER_PROBABILITY = 0.99
-# The cost of a dropped closure is the quantile of χ² at this probability
+# In the cost, the χ² of a dropped loop closure is replaced by the quantile of χ² at this
+# probability
 KEPT_CLOSURE_PROBABILITY = 0.999
 # Factor by which the control parameter of graduated non-convexity grows in each stage (Yang 2020,
 # section V)
@@ -54,11 +55,12 @@ _MAX_GNC_STAGES = 100
 # Maximum number of loop closures that are tested again after graduated non-convexity rejected them
 _MAX_TRIALS_TO_RESTORE_CLOSURES = 20
 _MAX_REWEIGHTING_ROUNDS = 20
-# Information matrices are divided by the factor by which they seem too large, if this factor is at
-# least the following value. False closures alone can cause smaller factors
+# The information matrices of the edges can be too large, so that loop closures are rejected. They
+# are divided by an estimated factor, if it is at least the following value. False loop closures
+# alone can cause smaller estimates
 MIN_INFORMATION_SCALE_FACTOR = 2.5
-# Minimum number of closures for an estimate of the factor by which information matrices are too
-# large
+# Minimum number of loop closures for an estimate of the factor by which the information matrices
+# are too large
 MIN_CLOSURES_FOR_SCALE_FACTOR = 10
 
 
@@ -193,7 +195,8 @@ def _solve_gnc(
 ) -> tuple[_Optimum, Array]:
     """Reject false closures by graduated non-convexity; return the optimum and the edge weights."""
     # Both limits are quantiles of the χ² distribution. A closure with χ² below chi2_bound keeps the
-    # weight 1. A dropped closure adds cost_if_dropped to the cost. Odometry edges are never dropped
+    # weight 1. In the truncated cost, cost_if_dropped replaces the χ² of a dropped closure.
+    # Odometry edges are never dropped
     half_degrees_of_freedom = model.count_observed_directions(graph.information) / 2.0
     chi2_bound = np.where(
         can_be_false_closure & (half_degrees_of_freedom > 0.0),
@@ -235,7 +238,8 @@ def _run_gnc(
     """Run graduated non-convexity from one start (Yang 2020, algorithm 1, eq. 13 and 14)."""
     residuals = start_residuals
     iteration_count = 0
-    # Initial control parameter: the inverse of the maximum over all edges (Yang 2020, section V)
+    # Initial control parameter of graduated non-convexity: 1 ÷ maximum of 2 χ² / chi2_bound - 1
+    # over all edges (Yang 2020, section V)
     inverse_control_parameter_by_edge = 2.0 * residuals.chi2 / chi2_bound - 1.0
     if np.max(inverse_control_parameter_by_edge) > 0.0:
         control_parameter = 1.0 / float(np.max(inverse_control_parameter_by_edge))
@@ -333,8 +337,9 @@ def analyse_graph(
     closure_tests: tuple[GateResult, ...] | Unavailable
     try:
         closure_tests = tuple(gate_edges(graph, closure_edges))
-        # If the information matrices seem too large, divide them by the factor and test again. Both
-        # estimates of the factor must be large: false closures enlarge the reduced χ² only
+        # If the information matrices of the edges seem too large, divide them by a factor, and test
+        # the closures again. The factor is the smaller of two estimates (reduced χ², median χ² of
+        # the closures): false closures enlarge only the reduced χ²
         if (
             reduced_chi2 > reduced_chi2_interval[1]
             and len(closure_tests) >= MIN_CLOSURES_FOR_SCALE_FACTOR
