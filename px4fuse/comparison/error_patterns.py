@@ -94,7 +94,8 @@ MAX_ATTITUDE_DELAY_S = 0.5
 # Minimum reported delay (s) of the logged attitude
 MIN_ATTITUDE_DELAY_S = 0.04
 MAX_ROTATION_COUNT = 20_000
-# Duration (s) of each rotation
+# Delay of the logged attitude: duration (s) of the rotations from attitude and gyroscopes that are
+# compared
 ROTATION_COMPARISON_TIME_S = 0.1
 # Differences (rad) between attitude and gyroscope rotations are limited to this value, because
 # attitude resets cause larger ones

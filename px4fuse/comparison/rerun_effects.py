@@ -31,11 +31,11 @@ MIN_OVERCONFIDENT_NEES_AFTER_CHANGE = 2.0
 # NEES): 1 - value after ÷ value before. With a fraction of 1, the filter is consistent. The change
 # is a possible cause of a wrong σ if the fraction differs from 1 by at most this value
 POSSIBLE_CAUSE_EXPLAINED_FRACTION_TOLERANCE = 0.5
-# A sensor fault is the only cause of a wrong σ if the fraction that its correction removes differs
-# from 1 by at most this value
+# A sensor fault is the only cause of a wrong σ if the fraction of ln(mean NIS) or ln(mean NEES)
+# that its correction removes differs from 1 by at most this value
 ONLY_CAUSE_EXPLAINED_FRACTION_TOLERANCE = 0.25
-# A change is combined with another change if the fraction that its re-run removes differs from 1 by
-# less than this value
+# A change is combined with another change if the fraction of ln(mean NIS) or ln(mean NEES) that its
+# re-run removes differs from 1 by less than this value
 COMBINED_CHANGE_EXPLAINED_FRACTION_TOLERANCE = 0.9
 SENSOR_CORRECTION_KEYS = frozenset((OUTLIERS_KEY, TIME_OFFSET_KEY, ROTATION_KEY, FORWARD_BIAS_KEY))
 # Settings and data corrections that have an effect only together with another change

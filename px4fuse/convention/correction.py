@@ -28,8 +28,8 @@ from .texts import FRAME_AXES, OPPOSITE_DIRECTION, format_axes
 # Minimum rotation (°) of the positions about the vertical that is corrected in addition to wrong
 # axes
 MIN_RESIDUAL_ROTATION_DEG = 8.0
-# Minimum rotation (°) of the positions about the vertical that is corrected if, apart from it, the
-# horizontal axes are correct
+# Minimum rotation (°) of the positions about the vertical that is corrected if the horizontal axes
+# have no other fault
 MIN_FRAME_ROTATION_DEG = 15.0
 # Minimum delay (s) of the position timestamps that is corrected together with axes and unit of the
 # positions

@@ -30,8 +30,8 @@ SAME_SAMPLE_TOLERANCE_IN_INTERVALS = 0.3
 # Maximum number of barometer samples that are reconstructed between two rows of
 # estimator_aid_src_baro_hgt
 MAX_SAMPLES_BETWEEN_LOGGED_ROWS = 30
-# The weight of a logged barometer sample is the number of EKF2 samples that it represents in the
-# replay. It is above 1 if neighbouring samples are missing. Maximum weight
+# Maximum weight of a logged barometer sample: the number of EKF2 samples that it represents in the
+# replay, above 1 if neighbouring samples are missing
 MAX_BAROMETER_SAMPLE_WEIGHT = 4.0
 # Lower limit of the sum of the low-pass filter weights of all missing samples in an interval; it
 # avoids a division by zero if no sample is missing

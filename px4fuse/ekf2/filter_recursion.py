@@ -711,8 +711,8 @@ def _compute_steady_state_correlation(segment: ReplaySegment) -> Array:
         (1, ACCELEROMETER_BIAS_NORTH, -GRAVITY_MAGNITUDE_M_S2),
         (0, ACCELEROMETER_BIAS_EAST, GRAVITY_MAGNITUDE_M_S2),
     ):
-        # The tilt error and the bias error cause acceleration errors that cancel. Their covariance
-        # is the smaller of their two variances
+        # The acceleration due to the tilt error and the accelerometer bias error are correlated.
+        # Their covariance is the smaller of their two variances
         common_variance = min(
             P[tilt_state, tilt_state] * acceleration_per_rad**2, P[bias_state, bias_state]
         )

@@ -59,8 +59,8 @@ def average_by_event(
         mean, (sensor_samples.value, sensor_samples.ned_to_body_rotation, sensor_samples.noise)
     )
     if VELOCITY in sensor_samples.state_slices:
-        # The optical flow samples do not contain the velocity change from the IMU since the start
-        # of the segment. Add it, as it is at the event
+        # The velocity change from the IMU since the start of the segment was subtracted from the
+        # optical flow samples. Add the velocity change up to the event
         velocity_m_s = segment.imu_velocity_change_m_s[event_end_steps]
         value = value + np.einsum("eab,eb->ea", ned_to_body_rotation, velocity_m_s)
     # A sample can itself be the mean of several EKF2 samples: add their numbers

@@ -48,8 +48,8 @@ NO_TRUTH_OVERLAP = Unavailable(
     "ground truth and replay do not overlap in time",
     "Record ground truth during the whole flight.",
 )
-# Names of the properties in which KF and EKF2 differ. One after the other is changed from KF's to
-# EKF2's property
+# Names of the properties in which KF and EKF2 differ. KF's properties are replaced by those of EKF2
+# one after the other
 SAMPLE_TIMES_REPLACEMENT_NAME = "sample times and time steps"
 TIMESTAMPS_REPLACEMENT_NAME = "timestamps and delay"
 MEASUREMENT_NOISE_REPLACEMENT_NAME = "measurement noise"
