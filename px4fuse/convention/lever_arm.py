@@ -77,7 +77,7 @@ def estimate_lever_arm(flight: Flight, track: PositionTrack) -> LeverArm | None:
 
 
 def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverArm | None:
-    """Fit a constant offset, a lever arm and a delay to the errors against ground truth."""
+    """Fit offset, lever arm, delay and rotation to the position errors against ground truth."""
     attitude, columns = flight.attitude, Columns.POSITION[:2]
     airborne_spans_s = () if isinstance(flight.airborne, Unavailable) else flight.airborne
     position_samples = track.samples[columns].dropna()

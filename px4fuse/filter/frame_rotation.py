@@ -79,7 +79,7 @@ class HeadingError(Record):
         Mean angle over the flight, and its σ.
     drifts : bool
         True if the angle changes significantly in flight.
-    parts : tuple of HeadingPart
+    parts : tuple of HeadingErrorInPart
         Angles in consecutive parts of the flight, clockwise from above.
     drift_p : float
         p-value of the test for a constant angle.

@@ -99,7 +99,7 @@ class SourceTimeOffset(Record, kw_only=True):
         Time offset that was already added to the timestamps.
     is_determinable : bool
         True if the 95 % interval is narrow.
-    parts : tuple of PartOffset
+    parts : tuple of FlightPartTimeOffset
         Offsets of consecutive parts of the flight.
     drift_ppm, drift_sigma_ppm : float or None
         Clock drift of the source; None with fewer than three parts.
