@@ -247,7 +247,8 @@ def find_detector_modules() -> dict[str, str]:
         for node in ast.walk(tree):
             if isinstance(node, ast.Constant) and node.value in FINDING_TITLES:
                 module_by_finding_id.setdefault(str(node.value), path.stem)
-    # Modules whose finding ids are no literals, because they are composed of a name and a suffix
+    # A finding id that a module composes of a name and a suffix does not appear in the source code
+    # of the module, so the module is stated here
     for name in FINDING_TITLES:
         if name.startswith("sigma_") or name.endswith("confident"):
             module_by_finding_id[name] = "noises"

@@ -255,7 +255,8 @@ def close_loop(
     TrajectoryError, LogError, MissingDataError, SettingsError
         A file cannot be read or lacks required data, or a number is out of range.
     """
-    # without reference: it may be a Trajectory, and is passed separately
+    # The request does not contain the argument ``reference``, which may be a Trajectory instead of
+    # a file name: :func:`analyse` has its own argument for the reference
     loop_request = request.LoopRequest(
         source=str(source),
         frame=frame,

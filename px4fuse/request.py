@@ -322,7 +322,7 @@ def command_line(
             arguments += ["--sweep", f"{sweep.parameter}={range_text}"]
         for name in shown_request.without:
             arguments += ["--without", name]
-        # px4fuse whatif gives all aiding sources the same start
+        # px4fuse whatif omits all aiding sources (--without) from the same time
         start_s = max(shown_request.without.values(), default=0.0)
         if start_s:
             arguments += ["--from", _format_value(start_s)]

@@ -47,7 +47,8 @@ from .rows import find_value
 
 ProgressCallback = Callable[[str], None]
 Results = ComparisonResults | AidsResults
-# Rows of measures.csv; "interval" is the field in the results that contains the 95 % interval
+# Numbers in the results that px4fuse diff compares between two reports: rows of measures.csv. The
+# column "interval" is the field in the results that contains the 95 % interval of the number
 COMPARED_NUMBER_DEFINITIONS = [
     row
     | {
@@ -218,7 +219,7 @@ def _list_setting_changes(results_a: Results, results_b: Results) -> Iterator[Se
 
 def _collect_parameters(results: Results) -> dict[str, float]:
     """Return the PX4 parameters in the results, rounded to the 6 digits of a float32."""
-    # The replay also contains the defaults of parameters that the log does not contain
+    # An EKF2 replay also gives the defaults of parameters that the log does not contain
     parameters = (find_value(results, "ekf2_replay.settings") or {}) | dict(results.log.parameters)
     return {name: float(f"{parameters[name]:.6g}") for name in sorted(parameters)}
 
@@ -229,8 +230,9 @@ def collect_compared_numbers(results: Results) -> dict[str, ComparedNumber]:
     # EKF2 rejects north and east together, so their rejected fractions are equal: keep only one
     horizontal_axes = [name for name in ("north", "east", AISLE_AXIS) if name in axes]
     omitted_paths = [f"axes.{name}.rejected_fraction" for name in horizontal_axes[1:]]
-    # the axes already contain the numbers of the aiding source that measured the positions; EKF2
-    # fuses all positions except those of GNSS as external vision
+    # omit the aiding source whose positions KF also uses: ``axes`` already contains EKF2's mean NIS
+    # and rejected fraction for these positions. EKF2 fuses all positions except those of GNSS as
+    # external vision
     if find_value(results, "source.kind") == "gnss":
         omitted_paths.append("aids.gnss_pos.")
     elif axes:

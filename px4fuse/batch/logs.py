@@ -66,7 +66,8 @@ def _find_logs_matching_pattern(pattern: str) -> list[LogAddress]:
     is_local = _is_local(file_system)
     try:
         if file_system.exists(root_path) and not file_system.isdir(root_path):
-            # also a device or pipe, which a worker process rejects with a message
+            # the path may also be a device or a pipe, without a size: a worker process rejects it
+            # with a message
             is_file = file_system.isfile(root_path)
             size_by_path = {root_path: file_system.size(root_path) if is_file else None}
         else:

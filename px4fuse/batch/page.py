@@ -46,7 +46,7 @@ AXIS_COLUMNS = [
     for name, path in RESULT_PATH_BY_COLUMN.items()
     if path.startswith(("axis.", "tuning.", "agreement."))
 ]
-# Table columns with one value per log that the details of a log list under "Flight"
+# Values of a log, by table column, that the page shows under "Flight" below the row of the log
 LOG_COLUMNS = (
     *("log", "log_sha256", "px4fuse", "settings", "vehicle", "firmware", "firmware_hash"),
     *("airframe", "hardware", "date", "duration_s", "source", "source_rate_hz", "aids"),
@@ -244,7 +244,7 @@ def _summarise_log(rows: list[dict[str, Any]]) -> LogSummary:
     summary: dict[str, Any] = dict(
         ChainMap(*sorted(rows, key=lambda row: AXES_BY_PREFERENCE.index(row.get("axis", "aisle"))))
     )
-    # one axis with results is sufficient
+    # a log is done if the results of at least one axis are done
     is_done = any(row["status"] == STATUS_DONE for row in rows)
     summary["status"] = STATUS_DONE if is_done else rows[0]["status"]
     if "headline" not in summary:  # a log without results

@@ -22,8 +22,9 @@ STATUS_DONE, STATUS_NOT_COMPARED, STATUS_FAILED = "done", "not compared", "faile
 FINDING_SEPARATOR = ";"
 
 
-# Rows of columns.csv. Rows with FILTER are repeated for each filter name. The repetition of the
-# other rows has no effect, because the dictionaries below contain each column once
+# Columns of the table of px4fuse batch: rows of columns.csv. A row that contains FILTER is repeated
+# for each filter name. Other rows are repeated too, without effect: the dictionaries below contain
+# each column once
 _COLUMN_DEFINITIONS = [
     {key: text.replace("FILTER", name) for key, text in row.items()}
     for _, rows in groupby(

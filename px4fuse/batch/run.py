@@ -227,10 +227,11 @@ def load_cached_rows(state: _BatchState, reports: bool) -> Iterator[CachedRows]:
         try:
             cached_rows = msgspec.json.decode(cache_file.read_bytes(), type=CachedRows)
         except (OSError, ValueError):
-            continue  # an unreadable file is ignored, and the log is compared again
+            # without a readable cache file, px4fuse compares KF and EKF2 for this log again
+            continue
         first_row = cached_rows.rows[0]
         output_columns: tuple[str, ...] = ()
-        if "axis" in first_row:  # the log was compared, so it has output files
+        if "axis" in first_row:  # KF and EKF2 were compared, so output files exist
             output_columns = OUTPUT_FILE_COLUMNS if reports else OUTPUT_FILE_COLUMNS[:1]
         output_files = [state.output / first_row.get(column, "") for column in output_columns]
         if (cached_rows.px4fuse, cached_rows.settings) == (state.version, state.settings) and all(

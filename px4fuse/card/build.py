@@ -142,7 +142,7 @@ def build_card(
         make_cause(analysis, ranked_cause, verdicts, request)
         for ranked_cause in ranked_causes[:MAX_CAUSES_ON_CARD]
     )
-    # the same verdicts; those that need no change of settings are marked as explained
+    # mark the verdicts on the reported σ that need no change of settings as explained
     sigma_verdicts, explanation = _explain_verdict_differences(analysis, verdicts, causes)
     effect = _summarise_errors(analysis)
     severity: CardSeverity = "clean"
@@ -348,7 +348,8 @@ def _describe_worst_axis(analysis: Analysis) -> list[str]:
     """State EKF2's error along another axis if it is overconfident there, more than along main."""
 
     def compute_error_to_sigma_ratio(result: AxisComparison) -> float:
-        # 0 for an axis that cannot be the worst: its error is unknown, or only EKF2's output lag
+        # An axis with ratio 0 is not described: EKF2's errors against ground truth are unknown or,
+        # along another axis than the main axis, are only due to the lag of EKF2's output
         truth = result.filters["ekf2"].truth
         if isinstance(truth, Unavailable) or (
             truth.has_only_lag_errors and result is not analysis.main
@@ -406,12 +407,13 @@ def _format_actions(causes: Sequence[DiagnosedCause], notes: Sequence[Note]) -> 
 
 def _format_action(action: Action) -> str:
     if action.where == "console":
-        # The sentence is "PARAMETER OLD → NEW UNIT", and the command contains the parameter name
+        # The sentence of this action is "PARAMETER OLD → NEW UNIT", and its command contains the
+        # parameter name
         value_change_text = action.sentence.partition(" ")[2]
         change_text = value_change_text if len(action.commands) == 1 else action.sentence
         return f"EKF2: {', '.join(action.commands)} ({change_text})"
     if action.where == "shell":
-        # The command is "px4fuse compare LOG --OPTION VALUE"
+        # The command of this action is "px4fuse compare LOG --OPTION VALUE"
         options_text = action.commands[0].partition(" --")[2]
         return f"KF: run again with --{options_text}"
     text = lowercase_first_letter(action.sentence.rstrip("."))
@@ -495,7 +497,8 @@ def _explain_differing_verdicts(
     }
     filters_with_differing_ratios = [
         source.filter
-        # verdicts of each filter: first against the source, then against ground truth
+        # sigma_verdicts contains two verdicts of each filter: from innovations (source), then from
+        # errors against ground truth
         for source, truth in zip(sigma_verdicts[::2], sigma_verdicts[1::2], strict=True)
         if source.ratio is not None
         and truth.ratio is not None

@@ -35,7 +35,8 @@ from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 from .model import Action, ActionTarget, CardRerun, DiagnosedCause, Verdict
 
 SETTING_CHANGE_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
-# Changes that shift the positions: only ground truth shows their effect
+# Kinds of changes in a re-run that shift or rotate the position measurements: only errors against
+# ground truth show their effect
 CHANGE_KINDS_VISIBLE_ONLY_IN_TRUTH = frozenset({"time offset", "delay", "rotation"})
 # Name endings of PX4 parameters that require a reboot (reboot_required)
 REBOOT_PARAMETER_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
@@ -59,7 +60,7 @@ ACTION_TARGET_BY_GROUP: Mapping[str, ActionTarget] = {
     "loops": "source",
     "logging": "logging",
 }
-# Findings for which the user must change another device or filter than for their group
+# Exceptions from ACTION_TARGET_BY_GROUP: device or filter that the user must change, by finding id
 ACTION_TARGET_BY_FINDING_ID: Mapping[str, ActionTarget] = {
     "source_drift": "source",
     "source_lever_arm": "EKF2",
@@ -88,7 +89,8 @@ class RankedCause(NamedTuple):
 
 def rank_causes(analysis: Analysis, cause_findings: Sequence[Finding]) -> list[RankedCause]:
     """Sort errors and warnings by importance; omit findings whose re-runs have no effect."""
-    # findings that only repeat the verdict on a filter name no cause: they are the last resort
+    # a finding that only repeats that the reported σ of a filter is wrong names no cause. Such
+    # findings are returned only if no finding names a cause
     causes, repeated_verdicts = list[RankedCause](), list[RankedCause]()
     for finding in cause_findings:
         if finding.severity == "note":
@@ -216,8 +218,9 @@ def _make_actions(
     actions = _make_sender_actions(analysis, ranked_cause, offset_rerun, request)
     alternative_action_groups: tuple[tuple[Action, ...], ...] = ()
     if delay_rerun:
-        # The user corrects either the timestamps or the delay parameter. Parameters that both
-        # corrections change (EKF2_DELAY_MAX) are a separate action
+        # The user corrects either the timestamps or the delay parameter: two alternatives. A
+        # parameter that both corrections change (EKF2_DELAY_MAX) is not part of the alternatives,
+        # but a further action
         offset_setting_names = offset_rerun.change.keys() if offset_rerun else ()
         delay_parameter_values = {
             name: value
@@ -285,16 +288,19 @@ def _make_sender_actions(
 ) -> list[Action]:
     """Return the action on the position source, or on the delay of GNSS in EKF2."""
     finding, source, model = ranked_cause.finding, analysis.source, analysis.ekf2_model
-    # users cannot shift the timestamps of a GNSS receiver, so they use the remedy of the finding
+    # users cannot shift the timestamps of a GNSS receiver: for GNSS, the action is the remedy of
+    # the finding, if the finding has one
     if offset_rerun and not (source.origin.is_gnss and finding.remedy):
         shift_s = offset_rerun.change[TIME_OFFSET_KEY]
-        # the change of KF includes the clock offset of this analysis
+        # a re-run of KF tests the total time offset. The sender corrects only the difference from
+        # the clock offset of this analysis (--clock-offset)
         if offset_rerun.filter == "kf":
             shift_s -= analysis.settings.clock_offset_s
         return [Action("sender", lowercase_first_letter(format_sender_action(source, shift_s)))]
     if (
         finding.id == "ekf2_gps_delay_wrong"
-        and not ranked_cause.reruns  # without a re-run, use the estimate in the finding
+        # without a re-run of EKF2 with another delay, use the delay that the finding estimates
+        and not ranked_cause.reruns
         and not isinstance(model, Unavailable)
     ):
         delay_change = make_delay_change(model.inputs, float(finding.evidence["estimate_ms"]))

@@ -124,7 +124,8 @@ def run_command(
     """
     readable_folders.set(folders)
     max_log_bytes.set(max_bytes)
-    # a sender exists only in a worker process; commands in the server process write no files
+    # Only worker processes have a sender, and only worker processes write files: the folder of the
+    # server process does not change
     if report_folder and sender:
         os.chdir(report_folder)
     output, results_json_texts = io.StringIO(), list[str]()

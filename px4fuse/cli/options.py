@@ -352,7 +352,7 @@ flight_options = _combine_options(
 )
 #: Options of commands that run KF on one flight
 analysis_options = _combine_options(filter_options, flight_options)
-#: Options of commands that run KF on many logs: ``analysis_options`` without a position file
+#: Options of commands that run KF on many logs: ``analysis_options`` without ``position_options``
 settings_options = _combine_options(
     filter_options, system_option, _clock_offset_option, max_size_option
 )

@@ -19,7 +19,7 @@ from .record import read_toml
 _UNIT_TABLES = read_toml(__file__, dict[str, dict[str, Any]], "units.toml")
 # Full name of each unit, by its symbol
 UNIT_NAME_BY_SYMBOL: Mapping[str, str] = _UNIT_TABLES["names"]
-# Unit of a field that is an option or the size of a fault, by the suffix of the field's name
+# Unit of an option or of the size of a fault, by the suffix of the name of its field
 UNIT_BY_SUFFIX = {
     "_m_s2": "m/s²",
     "_m_s": "m/s",
@@ -231,7 +231,8 @@ def convert_to_unit(text: str, unit: str) -> float | None:
         return None
     unit = unit.lower()
     unit_in_text = match[2].lower() or unit
-    # Units without other units of the same quantity are not in the tables
+    # {unit: 1.0} is for a unit that the tables do not contain, because its quantity has no other
+    # unit (Hz)
     for factors in ({unit: 1.0}, *_UNIT_FACTORS.values()):
         if {unit_in_text, unit} <= factors.keys():
             with suppress(ValueError):  # float() rejects several decimal points

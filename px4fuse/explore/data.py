@@ -129,7 +129,8 @@ def _make_imu_data(comparison: Comparison, encoder: ArrayEncoder) -> PageData | 
     time_s = acceleration.time_s
     gap_start_indices = np.flatnonzero(find_imu_gaps(time_s))
     gap_bounds_s = np.stack([time_s[gap_start_indices], time_s[gap_start_indices + 1]], 1)
-    # per row: no increase at the start of a gap, and an increase by its duration at its end
+    # a row of differences contains 0 for the start of a gap, and the duration (s) of the gap for
+    # its end
     cumulative_gap_duration_s = np.cumsum(np.diff(gap_bounds_s, prepend=gap_bounds_s[:, :1]))
     return {
         "time": encoder.add_times(time_s),

@@ -173,7 +173,7 @@ def make_practice_page(
         data, flight_html = _simulate_flight_data(practice_flight, flight_index)
         flights_html += flight_html
     return make_page_html(
-        data,  # of the last flight: the plots and axes of all flights are the same
+        data,  # plots and axes of the last flight, which are the same for all flights
         data_scripts=flights_html,
         command="practice",
         title="simulated flights with known faults",
@@ -188,16 +188,16 @@ def _simulate_flight_data(
 ) -> tuple[dict[str, Any], str]:
     """Return the data of a flight, and HTML elements with the data and the answers."""
     faults_and_sizes = practice_flight.faults_and_sizes
-    # the scenario already contains the noisy UWB
+    # the scenario already contains the noise of a noisy UWB, so it is not injected as a fault
     fault_options = [
         f"{fault.name}={size}" for fault, size in faults_and_sizes if fault.name != NOISY_UWB_FAULT
     ]
     simulation = flights.simulate(practice_flight.scenario, parse_faults(fault_options))
     flight = flights.to_flight(simulation, f"flight {flight_index + 1}")
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
-    # without the automatic correction of axes and timestamps, which would hide the injected fault
+    # do not correct axes and timestamps automatically: the correction would hide the injected fault
     prepared = prepare_comparison_inputs(flight, request, keep_positions_as_sent=True)
-    # with the request, from which the page makes its command
+    # store the request in the analysis: the page shows it as a px4fuse command
     analysis = replace(diagnose_comparison(compare(prepared)), request=request)
     fault_descriptions = [_describe_fault(*pair, analysis.findings) for pair in faults_and_sizes]
     card = _with_fault_headline(build_card(analysis, request), fault_descriptions)

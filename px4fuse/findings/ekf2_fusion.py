@@ -239,9 +239,9 @@ def _detect_slow_restart(analysis: PreparedComparison, fusion_flag: pd.Series) -
         last_gap_end_s = gap_ends_s[gap_ends_s < end_s].max(initial=-np.inf)
         unfused_times_s = time_s[(time_s >= last_gap_end_s) & (time_s < end_s)]
         if (
-            # The pause of fusion begins with this gap, not with an earlier one
+            # EKF2 stopped fusion because of this gap, not because of an earlier gap
             last_gap_end_s > start_s - EV_STOP_INTERVAL_S
-            # With one or two positions, EKF2 resumed fusion at once
+            # With only one or two unfused positions after the gap, EKF2 resumed fusion at once
             and len(unfused_times_s) > 2
             and unfused_times_s[1] - unfused_times_s[0] >= EV_START_INTERVAL_S
         ):
@@ -317,8 +317,9 @@ def detect_aid_faults(
         yield _make_not_fused_finding(
             fusion_parameter, aids_of_sensor, kf_position_aid, height_error_m
         )
-    # Overconfidence of the sensor that KF uses is reported for its positions. A change of the mean
-    # innovation also makes the NIS and the mean innovation of the flight wrong: test it first
+    # Other findings report the overconfidence of the aiding source whose positions KF also uses.
+    # Test first if the mean innovation changes in flight, because such a change also affects the
+    # mean NIS and the mean innovation of the whole flight
     for name, aid in aids_to_test.items():
         sensor_cause = _find_shared_sensor_cause(AIDS[name].switch, kf_position_aid)
         if not sensor_cause and any(result.change for result in aid.axes.values()):

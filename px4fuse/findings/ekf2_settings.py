@@ -41,9 +41,11 @@ from .model import (
     make_zero_length_spans,
 )
 
-# Severity "error" if EKF2's noise parameter is at least this factor too small or too large
+# Wrong measurement noise of EKF2: severity "error" if the noise is at least this factor too small
+# or too large
 MIN_NOISE_FACTOR_FOR_SEVERITY_ERROR = 2.0
-# Minimum fraction of rejected positions that the finding on a too small noise of EKF2 states
+# Wrong measurement noise of EKF2: the message states the fraction of positions that EKF2 rejects,
+# if the fraction is at least this value
 MIN_REJECTED_FRACTION_IN_MESSAGE = 0.05
 # Minimum fraction of rejected positions for a warning: with a gate of 5 √S, a consistent filter
 # rejects a fraction of 6e-7
@@ -219,7 +221,8 @@ def detect_parameter_changes(analysis: Analysis) -> Findings:
     ]
     edges_s = [segment.start_s, *(change.time_s for change in changes), segment.end_s]
     spans = [_assess_span(analysis, *span_s) for span_s in pairwise(edges_s)]
-    # Each change is compared with the spans before and after it
+    # Compare EKF2's mean NIS and position RMSE in the time spans before and after each parameter
+    # change
     for (time_s, name, value_before, value_after), (before, after) in zip(
         changes, pairwise(spans), strict=True
     ):

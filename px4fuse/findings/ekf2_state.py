@@ -46,30 +46,33 @@ BIAS_LIMIT_PARAMETERS = (
 )
 # A bias is at its limit if bias ÷ limit parameter is at least this ratio
 MIN_BIAS_TO_LIMIT_RATIO = 0.98
-# Minimum fraction of the flight with a bias at its limit, for a finding
+# Minimum fraction of the flight in which EKF2's accelerometer or gyroscope bias is at its limit,
+# for a finding
 MIN_TIME_AT_LIMIT_FRACTION = 0.5
 # Length (s) of the windows in which px4fuse tests if the vehicle is at rest before take-off
 REST_WINDOW_S = 1.0
 # Time (s) before take-off in which the motors run
 MOTOR_RUN_UP_DURATION_S = 0.5
-# Maximum standard deviation of angular rate (rad/s) and specific force (m/s²) at rest
+# Detection of rest before take-off: maximum standard deviation of angular rate (rad/s) and specific
+# force (m/s²) in a window
 MAX_ANGULAR_RATE_STD_AT_REST_RAD_S, MAX_SPECIFIC_FORCE_STD_AT_REST_M_S2 = 0.04, 1.5
-# Maximum change (rad/s) of the mean angular rate between windows at rest
+# Detection of rest before take-off: maximum change (rad/s) of the mean angular rate between windows
 MAX_ANGULAR_RATE_CHANGE_AT_REST_RAD_S = 0.01
-# Minimum gyroscope bias (rad/s) for a finding: the heading turns by 90° in 30 s
+# Minimum difference (rad/s) between the angular rate measured at rest and EKF2's gyroscope bias,
+# for a finding: it causes an attitude error of 86° in 30 s
 MIN_GYRO_BIAS_RAD_S = 0.05
-# Minimum |specific force at rest - gravity| (m/s²): above it, the finding on a bias at its limit
-# states the specific force at rest
+# If EKF2's accelerometer bias is at its limit, and the specific force measured at rest differs from
+# gravity by more than this value (m/s²), the message states the specific force
 MIN_GRAVITY_ERROR_M_S2 = 0.3
-# Maximum fraction of the flight without tilt or yaw alignment that gives no finding
+# Maximum fraction of the flight in which EKF2's tilt or heading is not aligned, without a finding
 MAX_UNALIGNED_FRACTION = 0.02
-# Maximum time (s) from tilt alignment to heading alignment without a finding
+# Maximum time (s) from EKF2's tilt alignment to its heading alignment, without a finding
 MAX_HEADING_ALIGNMENT_DELAY_S = 5.0
-# Height resets up to this time (s) after take-off are normal
+# Height resets of EKF2 up to this time (s) after take-off are normal
 TAKE_OFF_DURATION_S = 10.0
 # Maximum time (s) from the end of a position gap to the EKF2 reset that it causes
 MAX_RESET_DELAY_S = 5.0
-# A reset up to this time (s) after the start of fusion is normal: flags are logged at 1 Hz
+# A reset of EKF2 up to this time (s) after the start of fusion is normal: flags are logged at 1 Hz
 MAX_FUSION_START_TO_RESET_S = 1.0
 
 
@@ -196,8 +199,8 @@ def detect_missing_alignment(
     if not fuses_source_yaw:
         heading_action = _find_heading_action(flight, source)
         quantities.append(("yaw_align", "heading", heading_action))
-    # EKF2 aligns the heading after the tilt, so the time until tilt alignment is not the fault of
-    # the heading
+    # EKF2 aligns the heading after the tilt, so the time until tilt alignment does not count as
+    # delay of the heading alignment
     alignment_end_s = segment.start_s
     for flag, quantity, action in quantities:
         if flag not in ekf2.status_flags:

@@ -66,8 +66,9 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
     Return (filter, axis, error) for each error, largest mean NEES first.
     """
     alignment, min_kf_rmse_by_axis = comparison.source.alignment, dict[str, float]()
-    # Positions of a file that were shifted and rotated to fit EKF2's track contain errors of EKF2.
-    # An error of KF therefore counts only above the RMS residual of this fit, and never in height
+    # Positions of a file that were shifted and rotated to fit EKF2's track contain errors of EKF2,
+    # and so does KF's track. Ignore errors of KF up to the RMS residual of the fit. The residual is
+    # only horizontal: ignore all height errors of KF
     if alignment is not None and alignment.yaw_sigma_deg is not None:
         min_kf_rmse_by_axis = dict.fromkeys(comparison.axes, alignment.residual_rms_m or 0.0)
         min_kf_rmse_by_axis["down"] = np.inf
@@ -91,7 +92,8 @@ def detect(analysis: Analysis) -> Findings:
 def make_hidden_error_finding(
     analysis: Analysis, errors_not_in_innovations: list[tuple[FilterName, str, ErrorAboveSigma]]
 ) -> Finding:
-    # The main axis first; then the first, largest error of each filter counts
+    # Sort errors along the main axis before errors along other axes, but otherwise keep the order
+    # by size. The finding states the first error of each filter
     errors_not_in_innovations = sorted(
         errors_not_in_innovations, key=lambda entry: entry[1] != analysis.main.axis.name
     )
@@ -122,7 +124,7 @@ def make_hidden_error_finding(
             f"{analysis.axes[axis].axis.label}, reported σ "
             f"{format_metres(error.reported_sigma_m)} m."
         )
-    # The cause of the worst error or, without it, that of the other filter's error
+    # Cause of the worst error; if no re-run shows a cause, the cause of the other filter's error
     cause = rerun_by_filter.get(worst_filter) or next(iter(rerun_by_filter.values()), None)
     evidence[CAUSE_KEY] = classify_cause(analysis, cause)
     is_misaligned = False

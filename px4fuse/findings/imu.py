@@ -29,7 +29,7 @@ from .recording import DEFAULT_SDLOG_PROFILE, VISION_PROFILE_MASK
 
 # Maximum specific force (m/s²) of real sensors: 35 g, because the largest range is 32 g
 MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2 = 343.0
-# Minimum number of samples above this maximum specific force of real sensors, for a finding
+# Minimum number of samples above MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2, for a finding
 MIN_IMPLAUSIBLE_FORCE_SAMPLES = 3
 # Minimum accelerometer bias (m/s²) for severity "error"; it causes an error of 0.15 m in 1 s
 MIN_SEVERE_BIAS_M_S2 = 0.3
@@ -43,7 +43,7 @@ MIN_IMU_RATE_HZ = 50.0
 MIN_ATTITUDE_RATE_HZ = 10.0
 # Maximum normal duration (s) of clipping: a touch-down clips one or two samples
 MAX_CLIPPING_DURATION_S = 0.1
-# Minimum time (s) between clipped samples that the finding states as separate times
+# Clipped samples with at most this time (s) between them are in one time span of the finding
 MIN_TIME_BETWEEN_CLIPPINGS_S = 2.0
 # Mask of SDLOG_PROFILE, bit 4: full IMU rate (logged_topics.cpp)
 SDLOG_HIGH_RATE_MASK = 16
@@ -118,7 +118,7 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
             f"forward, {right:+.2f} right and {down:+.2f} down."
         )
         min_severe_bias_m_s2 = np.inf  # a bias that EKF2 estimates does not affect EKF2
-    else:  # test the vertical bias with the heights of the source
+    else:  # test the vertical accelerometer bias with the heights of the source
         error_m_s2 = 0.0
         if (result := analysis.axes.get("down")) is not None:
             error_m_s2 = estimate_mean_acceleration_error(result.axis) or 0.0

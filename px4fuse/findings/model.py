@@ -35,9 +35,9 @@ class CatalogueEntry(Record):
 FINDING_CATALOGUE: Mapping[str, CatalogueEntry] = read_toml(
     __file__, dict[str, CatalogueEntry], "catalogue.toml"
 )
-# Key in Finding.evidence: cause of the finding, one of the following values
+# Key in Finding.evidence: cause of the finding, one of the values below
 CAUSE_KEY = "cause"
-# Causes that are confirmed by a re-run of KF or EKF2
+# Values of CAUSE_KEY for causes that a re-run of KF or EKF2 confirms
 MEASUREMENT_NOISE_CAUSE = "measurement noise"
 PROCESS_NOISE_CAUSE = "process noise"
 OUTLIER_CAUSE = "outliers"
@@ -45,19 +45,20 @@ CLOCK_CAUSE = "clock"
 MISALIGNED_FRAME_CAUSE = "frame"
 WRONG_GATE_CAUSE = "gate"
 ACCELEROMETER_CAUSE = "accelerometer"
-# No re-run with a changed setting makes the filter consistent
+# Cause unknown: no re-run with a changed setting makes the filter consistent
 UNKNOWN_CAUSE = "elsewhere"
 # Key in Finding.evidence: σ of the white position noise ÷ assumed measurement noise
 WHITE_TO_ASSUMED_NOISE_RATIO_KEY = "white_over_assumed"
-# The finding is about an aiding source of EKF2 from the same sensor as KF's positions
+# Cause: the position source. The finding is about an aiding source of EKF2 from the same sensor as
+# KF's positions
 SOURCE_SENSOR_CAUSE = "the source's sensor"
-# The position source reports a wrong variance, and EKF2 uses this variance
+# Cause: the position source reports a wrong variance, and EKF2 uses this variance
 REPORTED_VARIANCE_USED_BY_EKF2_CAUSE = "EKF2's noise"
-# The mean innovation of the aiding source changes in flight
+# Cause: the mean innovation of the aiding source changes in flight
 INNOVATION_CHANGE_CAUSE = "change"
-# EKF2's position resets follow gaps in the position source
+# Cause of position resets of EKF2: gaps in the position source
 SOURCE_GAP_CAUSE = "gap"
-# The vehicle stayed on the ground
+# Cause of too little motion: the vehicle stayed on the ground
 VEHICLE_ON_GROUND_CAUSE = "never took off"
 # Key in Finding.evidence: property with a wrong convention ("axes", "unit", "time offset", ...)
 WRONG_CONVENTION_KEY = "convention"
@@ -189,7 +190,8 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         if (
             cause_group is None
             or (cause_group[0].severity == "note" and cause in CAUSES_ONLY_ABOVE_SEVERITY_NOTE)
-            # White noise above the assumed noise can also cause these effects
+            # The white position noise exceeds the measurement noise that a filter assumes. It may
+            # also cause the findings that the time-correlated noise would explain
             or WHITE_TO_ASSUMED_NOISE_RATIO_KEY in cause_group[0].evidence
         ):
             continue

@@ -270,7 +270,9 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
 
 def detect_inconsistent_variances(analysis: Analysis) -> Findings:
     for filter_name, is_underconfident in product(FILTER_NAMES, (True, False)):
-        horizontal_finding_id = None  # cause of the finding on the vertical axis
+        # id of the finding on the horizontal axes, which is the cause of the finding on the
+        # vertical axis
+        horizontal_finding_id = None
         for axes in AXIS_GROUPS:
             inconsistent_axes = [
                 (analysis.axes[name], summary)
@@ -419,8 +421,8 @@ def _has_default_noises(
     default_noise = log.find_default_value(parameter)
     if log.parameters.get(parameter, default_noise) != default_noise:
         return False
-    # EKF2 does not use the parameter if R differs from it, for example because of reported
-    # variances. Unknown R (NaN) counts as the default
+    # If √R differs from the noise parameter, EKF2 does not use the parameter as R, for example
+    # because the source reports variances. Unknown R (NaN) counts as the default
     ratio = find_ekf2_noise_m(result) / default_noise
     return not max(ratio, 1.0 / ratio) > MAX_RATIO_OF_EQUAL_NOISES
 
@@ -454,7 +456,8 @@ def _find_sigma_action_without_replay(
     if not (estimated_noise_m := noise.value or noise.high):
         return UNEXPLAINED_SIGMA_ACTION
     noise_m, used_noise_m = max(estimated_noise_m, EKF2_MIN_NOISE_M), find_ekf2_noise_m(result)
-    # Above 1 if a change to the estimate corrects σ
+    # Above 1 if the estimate is on the right side of the used noise: smaller if EKF2 is
+    # underconfident, larger if EKF2 is overconfident
     ratio = used_noise_m / noise_m if ekf2_summary.sigma_ratio < 1.0 else noise_m / used_noise_m
     if not ratio > MAX_RATIO_OF_EQUAL_NOISES:  # the comparison is False for NaN
         return (
@@ -463,7 +466,7 @@ def _find_sigma_action_without_replay(
         )
     parameters, reported_noise_m = analysis.flight.log.parameters, 0.0
     noise_setting_m = parameters.get(aid.noise, np.inf)
-    # EKF2 then used the variances in the messages
+    # If the used noise exceeds the noise parameter, EKF2 used the variances in the messages
     if used_noise_m > MIN_USED_TO_PARAMETER_NOISE_RATIO * noise_setting_m:
         reported_noise_m = used_noise_m
     noise_change = make_noise_change(aid, parameters, reported_noise_m, noise_m)

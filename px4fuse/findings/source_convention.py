@@ -83,8 +83,9 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
         if FINDING_CATALOGUE[item.id].status_if_convention_wrong == "effect"
     ]
     if findings_of_unusable_positions:
-        # A convention found with unusable positions is not valid, nor are findings from positions.
-        # But a lever arm does not change the heading of the orientation
+        # If positions are unusable, a convention (axes, unit, ...) estimated from them is not
+        # valid, nor are other findings from positions. Exception: a wrong lever arm does not affect
+        # the heading of the orientation, so the finding on the orientation remains
         if {item.id for item in findings_of_unusable_positions} != {"source_lever_arm"}:
             cause_findings = []
         cause_findings = [
@@ -102,7 +103,8 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
             )
         ]
     elif faults.orientation == "copied" and not faults.has_position_fault:
-        cause_findings = []  # a copied orientation does not affect other findings
+        # an orientation that is a copy of EKF2's attitude does not affect other findings
+        cause_findings = []
     cause_findings += [
         item
         for item in findings
@@ -127,7 +129,8 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
     first_cause, *other_causes = cause_findings
     return [
         first_cause,
-        # Effects of other causes are dropped: without the wrong convention, they may be absent
+        # Findings on EKF2 become effects of the wrong convention. Those with another cause are
+        # omitted, because they may be absent with the right convention
         *(
             replace(item, message=f"{item.title}.", caused_by=first_cause.id)
             for item in other_findings
@@ -152,7 +155,8 @@ def _detect_position_faults(
     stated_frame = source.alignment.frame.upper() if source.alignment else "NED"
     axes = find_axes_in_file(convention.axes, stated_frame)
     rotation_deg = faults.rotation_deg
-    # A rotation of a file by a multiple of 90° to a usual frame is another --position-frame
+    # If positions of a file are rotated by a multiple of 90° relative to a usual frame, such as
+    # ENU, the user must choose another --position-frame
     is_file_in_other_frame = (
         rotation_deg
         and is_position_file
@@ -162,7 +166,8 @@ def _detect_position_faults(
     if faults.has_wrong_axes or is_file_in_other_frame:
         orientation = convention.orientation
         frame_sentence = "The analysis uses the positions converted to NED."
-        # The frame of the orientation is then the best guess for the frame of the positions
+        # If EKF2 took its heading from the position source, the direction of north is unknown. The
+        # best guess for the frame of the positions is the frame of the orientation
         if faults.is_north_unknown and orientation and axes not in FRAME_AXES.values():
             axes = FRAME_AXES.get(orientation.frames[-3:], axes)
             frame_sentence = (

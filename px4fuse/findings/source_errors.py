@@ -72,7 +72,7 @@ MIN_NOISY_PART_SIGMA_RATIO = 2.0
 MIN_NOISY_PART_SIGMA_RATIO_WITHOUT_OUTLIERS = 1.5
 # Minimum ratio of the noise in one flight part to the noise in the rest, for severity "error"
 MIN_NOISY_PART_SIGMA_RATIO_FOR_SEVERITY_ERROR = 4.0
-# Minimum scale factor error (ratio minus 1) against ground truth: 0.8 m in 10 m
+# Minimum scale factor error (measured ÷ true distance, minus 1) against ground truth: 0.8 m in 10 m
 MIN_SCALE_ERROR_AGAINST_TRUTH = 0.08
 # Minimum jitter (s) for severity "error"; it causes a position error of 3 cm at 1 m/s
 MIN_JITTER_FOR_SEVERITY_ERROR_S = 0.03
@@ -116,7 +116,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         not isinstance(noise, TimeCorrelatedNoise)
         or noise.gain_nats < MIN_CORRELATED_NOISE_LOG_LIKELIHOOD_RATIO_NATS
         or noise.slow_m < MIN_CORRELATED_NOISE_SIGMA_M
-        # A low-pass filter explains the correlation: source_positions.py reports it
+        # A low-pass filter explains the correlated position errors: source_positions.py reports it
         or noise.low_pass_gain_nats >= MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS
     ):
         return
@@ -179,7 +179,8 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
 def detect_unequal_noise(analysis: Analysis) -> Findings:
     """Detect that the position noise differs between two horizontal directions."""
     if analysis.source.origin.is_gnss:
-        return  # the estimate lacks time-correlated noise, which dominates in GNSS
+        # The noise estimate contains only white noise, but time-correlated noise dominates in GNSS
+        return
     axis_noises = sorted(
         (noise.value, noise.low, noise.high, axis_tuning.name)
         for axis_tuning in analysis.axis_tunings
@@ -317,7 +318,8 @@ def detect_scale_error(analysis: Analysis, error_fit: ErrorFit) -> Findings:
 
 def detect_imu_oscillation(analysis: Analysis) -> Findings:
     """Detect an oscillation of the accelerometer that the positions do not contain."""
-    if find_low_pass(analysis) is not None:  # the low-pass filter may remove the motion
+    if find_low_pass(analysis) is not None:
+        # the low-pass filter of the source may have removed the oscillation from the positions
         return
     oscillation = analysis.imu_oscillation
     if oscillation is not None:

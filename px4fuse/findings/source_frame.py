@@ -32,7 +32,8 @@ MIN_MISALIGNMENT_SIGMAS = 4.0
 MIN_HEADING_ERROR_DEG = 5.0
 # Minimum yaw misalignment (°), for severity "error": 26 % of the motion appears on the other axis
 MIN_SEVERE_HEADING_ERROR_DEG = 15.0
-# Minimum ratio: EKF2's heading drift against ground truth ÷ drift against the position source
+# Minimum ratio for a finding on heading drift: drift of EKF2's heading against ground truth ÷ drift
+# estimated from the position source
 MIN_TRUE_TO_ESTIMATED_HEADING_DRIFT_RATIO = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 ALIGNED_VISION_TOPIC = "estimator_visual_odometry_aligned"
@@ -82,7 +83,8 @@ def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Find
         if not _truth_contradicts_heading_drift(analysis.flight, heading_error):
             yield _make_heading_drift_finding(analysis, heading_error)
         return
-    # An accelerometer bias resembles a rotation. Estimated together, the rotation is insignificant
+    # An accelerometer bias has a similar effect as a rotation of the positions. The bias explains
+    # the effect if the rotation is not significant in a common estimate of both
     is_explained_by_bias = (
         not isinstance(systematic_errors, Unavailable)
         and source.orientation is None

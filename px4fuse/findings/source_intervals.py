@@ -39,11 +39,12 @@ MIN_MISSING_FRACTION_FOR_DOWNSAMPLING = 0.25
 # Downsampling gives intervals between positions of two lengths: n or n + 1 periods of the source.
 # Minimum fraction of intervals with these lengths, to report downsampling
 MIN_FRACTION_OF_TWO_MOST_FREQUENT_INTERVALS = 0.85
-# Downsampling gives intervals of n or n + 1 source periods. Minimum fraction of intervals with the
-# rarer of the two lengths
+# Downsampling gives intervals of two lengths: n or n + 1 periods of the source. Minimum fraction of
+# intervals with the rarer of the two lengths, to report downsampling
 MIN_FRACTION_OF_RARER_INTERVAL_LENGTH = 0.1
 # Maximum RMS deviation of the intervals from multiples of a tested source period, as fraction of
-# the period, to report downsampling. Intervals with jitter have 0.03, random intervals 0.29
+# the period, to report downsampling. The deviation is 0.03 for intervals with jitter, and 0.29 for
+# random intervals
 MAX_RMS_ROUNDING_ERROR_IN_PERIODS = 0.06
 # px4fuse searches the period of a downsampled source among the median interval ÷ n, n = 1, 2, … to
 # this value
@@ -256,7 +257,8 @@ def detect_downsampling(analysis: Analysis) -> Findings:
     """Detect positions that were downsampled before PX4 received them."""
     source = analysis.source
     # This test is valid only if the timestamps are the times at which PX4 received the positions.
-    # EKF2's own copies of the positions, and all origins behind them, have other timestamps
+    # EKF2's own copies of the positions, and the origins after them in SOURCE_ORIGINS, have other
+    # timestamps
     if (
         source.clock_map is not None
         or source.origin.find_preference_rank() >= ALIGNED_BY_EKF2_ORIGIN.find_preference_rank()

@@ -61,13 +61,15 @@ MIN_MOTION_RANGE_TO_NOISE_RATIO = 1.25 * 3.29
 MIN_LOW_PASS_LOG_LIKELIHOOD_RATIO_NATS = 6.0
 # Minimum log likelihood ratio (nats) of the low-pass model to the model of time-correlated noise
 MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS = 1.0
-# If the lag estimated from the autocorrelation of the position errors exceeds this multiple of the
-# upper 95 % limit of the delay relative to the IMU, px4fuse uses the delay as the lag of the
-# low-pass filter
+# Lag of the low-pass filter that the source applies to its positions: px4fuse uses the lag
+# estimated from the autocorrelation of the position errors. If it exceeds this multiple of the
+# upper 95 % limit of the delay relative to the IMU, px4fuse uses the delay instead
 MAX_ESTIMATED_LAG_TO_DELAY_RATIO = 4.0
-# Minimum filter lag (s) for a warning; it causes a position error of 5 cm at 1 m/s
+# Minimum lag (s) of low-pass filtered positions for a warning; it causes a position error of 5 cm
+# at 1 m/s
 MIN_FILTER_LAG_S = 0.05
-# Minimum filter lag (s) for severity "error"; it causes a position error of 10 cm at 1 m/s
+# Minimum lag (s) of low-pass filtered positions for severity "error"; it causes a position error of
+# 10 cm at 1 m/s
 MIN_FILTER_LAG_FOR_SEVERITY_ERROR_S = 0.10
 # Minimum position jump (m) for a warning: twice the noise of a good UWB system (0.1 m)
 MIN_JUMP_M = 0.2
@@ -106,11 +108,14 @@ EV_CTRL_HORIZONTAL_MASK, EV_CTRL_HEIGHT_MASK = 1, 2
 MAX_JUMP_TO_RESET_COUNTER_TIME_S = 1.0
 # Minimum position jump (m) for severity "error": five times the noise of a good UWB system (0.1 m)
 MIN_JUMP_FOR_SEVERITY_ERROR_M = 0.5
-# Minimum scale factor error (ratio minus 1) for a warning: flights without a fault reach 0.11
+# Minimum scale factor error (measured ÷ true distance, minus 1) for a warning: flights without a
+# fault reach 0.11
 MIN_SCALE_ERROR_FOR_WARNING = 0.12
-# Minimum scale factor error (ratio minus 1), for severity "error": 1 m in a distance of 7 m
+# Minimum scale factor error (measured ÷ true distance, minus 1), for severity "error": it causes an
+# error of 1 m in a distance of 7 m
 MIN_SCALE_ERROR_FOR_SEVERITY_ERROR = 0.15
-# Minimum |scale factor error| / σ: 0.3 % of correct sources exceed 3
+# Minimum |scale factor error| ÷ σ of its estimate, for a finding: 0.3 % of position sources without
+# a scale factor error exceed 3
 MIN_SCALE_ERROR_TO_SIGMA_RATIO = 3.0
 # Minimum fraction of outliers for a warning: normal noise has 0.02 % beyond 3.7 σ
 MIN_OUTLIER_FRACTION = 0.005
@@ -120,9 +125,11 @@ MIN_OUTLIER_FRACTION_FOR_SEVERITY_ERROR = 0.02
 MIN_OUTLIERS = 3
 # Minimum fraction of positions with logged innovations, to state the number of rejected outliers
 MIN_LOGGED_POSITION_FRACTION = 0.75
-# Warning if the reported position variance is at least this factor too small or too large
+# Warning if the variance reported by the position source is at least this factor too small or too
+# large
 MIN_VARIANCE_ERROR_FACTOR = 2.0
-# Severity "error" if the reported variance is at least this factor too small or too large
+# Severity "error" if the variance reported by the position source is at least this factor too small
+# or too large
 MIN_VARIANCE_ERROR_FACTOR_FOR_SEVERITY_ERROR = 3.0
 
 
@@ -153,7 +160,8 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     ):
         return None
     correlated_noise = analysis.time_correlated_noise
-    # Correlated errors are not due to a low-pass filter if time-correlated noise fits as well
+    # Time-correlated noise also causes correlated position errors: report a low-pass filter only if
+    # it fits better than time-correlated noise
     if (
         isinstance(correlated_noise, TimeCorrelatedNoise)
         and correlated_noise.low_pass_gain_nats < MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS
@@ -254,7 +262,7 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
         constant_axes_mask, measured_axes_mask = EV_CTRL_HEIGHT_MASK, EV_CTRL_HORIZONTAL_MASK
     elif coordinates == ["x", "y"]:
         consequence = "Only the height is evaluated."
-    else:  # only x, only y, or all
+    else:  # only x, only y, or all three are constant
         make_finding, consequence = make_error, NO_ESTIMATES_SENTENCE
         if "z" in coordinates:
             constant_axes_mask |= EV_CTRL_HEIGHT_MASK
@@ -388,7 +396,8 @@ def detect_scale_error(analysis: Analysis) -> Findings:
         isinstance(imu, Unavailable)
         or is_rate_too_low(imu, MIN_IMU_RATE_HZ)
         or analysis.source.origin.is_gnss  # GNSS has no scale factor error
-        or isinstance(analysis.flight.truth, Truth)  # source_errors.py compares with ground truth
+        # With ground truth, source_errors.py detects the scale factor error
+        or isinstance(analysis.flight.truth, Truth)
         or isinstance(systematic_errors, Unavailable)
         # The effects of a low-pass filter or of time-correlated noise resemble a scale factor error
         or find_low_pass(analysis) is not None

@@ -33,18 +33,22 @@ from .model import (
 MAX_RECEIPT_JITTER_S = 0.010
 # Maximum time (s) from the arrival timestamp of a position to its publication by PX4
 MAX_ARRIVAL_TO_PUBLICATION_DELAY_S = 0.001
-# Minimum latency (s) for a warning; it causes a position error of 2 cm at 1 m/s
+# Minimum latency (s) of positions, from measurement to arrival, for a finding if TIMESYNC converges
+# in flight; it causes a position error of 2 cm at 1 m/s
 MIN_LATENCY_S = 0.02
-# Minimum latency (s) for severity "error"; it causes a position error of 10 cm at 1 m/s
+# Minimum latency (s) for severity "error" if TIMESYNC converges in flight, and minimum increase (s)
+# of the latency in flight for a finding; it causes a position error of 10 cm at 1 m/s
 MIN_LATENCY_FOR_SEVERITY_ERROR_S = 0.10
 # Minimum rank correlation of latency with time, for a latency that grows in flight
 MIN_CORRELATION_OF_LATENCY_WITH_TIME = 0.8
 # Minimum fraction of positions that EKF2 drops because of their latency, for a finding
 MIN_DROPPED_POSITION_FRACTION = 0.02
-# Minimum number of positions before and after TIMESYNC converges, to detect the convergence
+# Minimum number of positions before and after the convergence of TIMESYNC, to detect the
+# convergence
 MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC = 10
-# Minimum fraction of position timestamps that are arrival times (in the whole flight, or until
-# TIMESYNC converges), and of later timestamps that are measurement times, for a finding
+# Timestamps are arrival times before TIMESYNC converges, and measurement times afterwards. Minimum
+# fraction of timestamps of the expected kind in each part of the flight, or of arrival times in the
+# whole flight, for a finding
 MIN_FRACTION_OF_EXPECTED_TIMESTAMP_KIND = 0.95
 # Minimum mean number of positions in a burst (positions that arrive together)
 MIN_BURST_POSITIONS = 2.5

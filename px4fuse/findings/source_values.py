@@ -50,10 +50,11 @@ MIN_SENDER_DISTANCE_SIGMAS = 4.0
 WINDOW_SAMPLES = 16
 # Minimum number of windows of WINDOW_SAMPLES samples in a flight, to detect two senders
 MIN_SAMPLE_WINDOWS_TO_DETECT_TWO_SENDERS = 10
-# Positions are copies of EKF2's estimate if the median distance (m) is below this limit
+# Positions are copies of EKF2's estimate if their median distance (m) from the estimate is below
+# this limit
 MAX_DISTANCE_OF_COPY_M = 0.01
-# Fused positions are copies of EKF2's estimate if the median distance (m) is below this stricter
-# limit: fusion alone pulls the estimate towards the positions
+# Stricter limit (m) than MAX_DISTANCE_OF_COPY_M if EKF2 fuses the positions: the fusion alone pulls
+# EKF2's estimate towards the positions
 MAX_DISTANCE_OF_FUSED_COPY_M = 0.001
 # To find positions that are copies of EKF2's position, both are compared only above this speed
 # (m/s): at rest, a correct source agrees too
@@ -110,7 +111,8 @@ def detect_invalid_positions(analysis: Analysis) -> Findings:
         make_finding = make_note if reason == "NaN" and not is_long else make_warning
         error_text = ""
         if is_long:
-            # Last position before the span, and first position after it
+            # Last valid position before the time span of invalid positions, and first valid
+            # position after it
             valid_times_s = analysis.input_axes[0].measurement_time_s
             first_row, last_row = np.clip(
                 np.searchsorted(valid_times_s, (start_s, end_s)), 1, len(valid_times_s) - 1
@@ -178,7 +180,8 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
         MIN_ROTATION_DEG, MIN_ROTATION_SIGMAS * lever_arm.rotation_sigma_deg
     ):
         rotation_deg = 0.0
-    # The position of the sensor or that of the IMU is wrong. If replays are possible, they decide
+    # Either the position of the sensor or that of the IMU is wrong in the parameters. If EKF2 can
+    # be replayed, replays with a corrected position decide which of them is wrong
     effect_sentence = _describe_replayed_effect(analysis, change, rotation_deg)
     if effect_sentence is not None:
         sensor_text, error_text = f"{source.kind_name} sensor", "the position error"
@@ -234,7 +237,7 @@ def _describe_replayed_effect(
         return ""
     rmses_m, ekf2_model = [], misalign_positions(ekf2_model, -rotation_deg, 0.0)
     changed_model = ekf2_model
-    # The model does not take the position of the IMU from the parameters: move the IMU instead
+    # The EKF2 model does not read the position of the IMU from the parameters: change its inputs
     if change.keys() <= {*IMU_POSITION_PARAMETERS}:
         inputs = ekf2_model.inputs
         imu_offset_m = np.array([*change.values(), inputs.imu_offset_m[2]])
@@ -274,7 +277,8 @@ def detect_two_senders(analysis: Analysis) -> Findings:
         window_count, WINDOW_SAMPLES, -1
     )
     window_medians_m = np.median(deviation_windows_m, axis=1)
-    # A lost sample inverts the later medians: give all the direction of the largest
+    # A lost sample exchanges the senders, so the medians of all later windows have the opposite
+    # sign. Invert the medians that point away from the largest median
     largest_median_m = window_medians_m[np.argmax(np.linalg.norm(window_medians_m, axis=1))]
     window_medians_m[window_medians_m @ largest_median_m < 0.0] *= -1.0
     difference_between_senders_m = np.median(window_medians_m, axis=0)
@@ -324,7 +328,8 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
         distance_m = np.linalg.norm(positions - ekf2_position_spline(time_s), axis=1)
         return float(np.median(distance_m[is_inside]))
 
-    # Some of the positions are sufficient to find the delay
+    # To find the delay of positions that are copies of EKF2's position, some positions are
+    # sufficient
     some_samples = samples[:: max(1, len(samples) // POSITION_COUNT_TO_FIND_DELAY_OF_COPY)]
     delay_s = min(
         TESTED_DELAYS_OF_COPIED_ESTIMATE_S.tolist(),

@@ -37,7 +37,8 @@ class Aid:
     label: str = ""
     # Unit of the innovations
     unit: str = "m"
-    # Noun phrase for users: data from which EKF2 computes the measurement variance R
+    # Data from which EKF2 computes the measurement variance R, as noun phrase for users; "" if R is
+    # the square of the parameter ``noise``
     noise_source_text: str = ""
     # Innovation gate (√S) if the log contains no gate parameter
     default_gate: float = 5.0
@@ -69,7 +70,8 @@ AID_MASK_PARAMETER = "EKF2_AID_MASK"
 GNSS_MODE_PARAMETER = "EKF2_GPS_MODE"
 # Relative tolerance of parameter ranges, because logged values are rounded to float32
 FLOAT32_TOLERANCE = 1e-6
-# Minimum similarity (difflib ratio, 0 to 1) of a mistyped name; other PX4 parameters have less
+# Minimum similarity (difflib ratio, 0 to 1) of an unknown name to a parameter of the EKF2 model, to
+# suggest this parameter; the names of other PX4 parameters are less similar
 MIN_SIMILARITY_OF_MISTYPED_PARAMETER = 0.9
 # Delay (ms) from fix to timestamp of the first GNSS receiver (since PX4 v1.17)
 RECEIVER_DELAY_PARAMETERS = ("SENS_GNSS0_DELAY", "SENS_GPS0_DELAY")
@@ -134,8 +136,8 @@ def _read_parameters(file_name: str) -> dict[str, Parameter]:
     }
 
 
-# Parameters of the EKF2 model. PX4 limits neither the maximum of gates nor positions: 1000 SD and
-# 100 m are limits of px4fuse
+# Parameters of the EKF2 model. PX4 limits neither innovation gates (maximum) nor positions of
+# sensors: 1000 SD and 100 m are limits of px4fuse
 MODEL_PARAMETERS = _read_parameters("model_parameters.csv")
 # All parameters with a known unit, default and range
 KNOWN_PARAMETERS = MODEL_PARAMETERS | _read_parameters("logged_parameters.csv")

@@ -46,7 +46,8 @@ class SourceOrigin(Record):
 
     # Kind of the sensor, inferred from the data
     kind: PositionKind
-    # Logged data that contain the positions, for example "as received" by the autopilot
+    # Data that contain the positions, for example "as received": messages that the autopilot
+    # received
     route: PositionRoute
     # EKF2's aiding source for these positions; None if EKF2 never fuses them
     aid: Aid | None
@@ -95,7 +96,7 @@ ALIGNED_BY_EKF2_ORIGIN = SourceOrigin("uwb", "aligned by EKF2", EV_POS)
 KEPT_BY_EKF2_ORIGIN = SourceOrigin("uwb", "kept by EKF2", EV_POS)
 REBUILT_FROM_INNOVATIONS_ORIGIN = SourceOrigin("uwb", "rebuilt from innovations", EV_POS)
 GNSS_ORIGIN = SourceOrigin("gnss", "as received", GNSS_POS, is_selectable_by_default=False)
-# All origins of positions, in order of preference
+# All kinds of position sources, in order of preference
 SOURCE_ORIGINS = (
     POSITION_FILE_ORIGIN,
     AS_RECEIVED_ORIGIN,
@@ -167,7 +168,7 @@ class ClockConversion(Record):
 
     # Name of the clock ("UNIX time of system 1, component 197")
     clock: str
-    # Source of the conversion, for example "TIMESYNC" or "receive time"
+    # Data from which this conversion was estimated, for example "TIMESYNC" or "receive time"
     method: str
     # Number of simultaneous readings of this clock and the boot clock
     pairs: Count
@@ -175,11 +176,11 @@ class ClockConversion(Record):
     offset_s: float
     # Rate of the boot clock minus rate of this clock
     drift_ppm: float
-    # Robust standard deviation of the readings from the fitted line
+    # Robust standard deviation of the simultaneous readings from the line fitted to them
     jitter_s: NonNegativeFloat
-    # Limitation of the conversion, if any
+    # Limitation of the clock conversion, if any
     note: str = ""
-    # Number of distinct timestamps, if they are too few for a conversion
+    # Number of distinct timestamps, if they are too few to convert the clock
     distinct_stamps: Count | None = None
 
 
@@ -304,11 +305,11 @@ MAX_UWB_RATE_HZ = 25.0
 MIN_LANDED_DURATION_S = 5.0
 BODY_AXES = ("forward", "right", "down")
 AXIS_NAMES: tuple[NedAxis, NedAxis, NedAxis] = ("north", "east", "down")
-# Names of position sources in texts, where the name is not the kind in capitals
+# Names of kinds of position sources in texts; other kinds are printed in capitals ("UWB")
 SOURCE_NAMES: Mapping[str, str] = {"unknown": "external vision", "file": "position file"}
 
 
-# dtype object: pandas reserves 1 GB of address space for the first column of strings
+# dtype object instead of str: pandas reserves 1 GB of address space for the first column of strings
 NO_INVALID_ROWS: pd.Series[str] = pd.Series(dtype=object, index=pd.Index([], dtype=np.float64))
 
 
@@ -359,13 +360,13 @@ class Alignment(Record, kw_only=True):
     # Frame of the file: "ned", "enu", "nwu", "eus" or "edn"
     frame: str
     frame_reason: str
-    # Rotation about the vertical, clockwise from above
+    # Rotation from the frame of the file to NED about the vertical, clockwise from above
     yaw_deg: float
     yaw_sigma_deg: NonNegativeFloat | None = None
     yaw_reason: str
-    # Origin of the file in NED
+    # Position (NED) of the origin of the file's frame
     origin_m: Vector
-    # Boot time minus timestamp of the file
+    # Time since boot minus timestamp in the file
     clock_offset_s: float
     clock_offset_sigma_s: NonNegativeFloat | None = None
     clock_reason: str
@@ -373,7 +374,7 @@ class Alignment(Record, kw_only=True):
     reference: str
     # Correlation of the aligned positions with the reference
     correlation: float | None = None
-    # Horizontal position residual (RMS per axis)
+    # Horizontal residual (RMS per axis) between the aligned positions and the reference
     residual_rms_m: NonNegativeFloat | None = None
     # Sentences about wrong axes, yaw or origin
     misplaced: tuple[str, ...] = ()

@@ -165,8 +165,8 @@ def list_log_contents(flight: Flight) -> Inventory:
         reason = replace_argument_names(error.reason).removeprefix(f"{log.name}: ")
         missing_position_remedy = replace_argument_names(error.remedy)
         if not isinstance(error, MissingDataError):
-            # The log has too few positions. The advice of the error, other settings of the
-            # analysis, does not help for the next log
+            # The log has too few positions. The error advises other settings of the analysis, which
+            # do not help for the next flight
             missing_position_remedy = (
                 "Set SDLOG_MODE to 0 (logging from arming) to record the whole flight."
             )
@@ -362,7 +362,7 @@ def _collect_logging_advice(
     findings += imu.detect_low_rates(flight)
     needed_data: tuple[object, ...] = list_missing_data(flight)
     if not flight.log.writes_ulog:
-        # A MAVLink recording cannot contain the other data
+        # A MAVLink recording can contain only these data
         needed_data = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
     actions_and_purposes = [
         (missing_position_remedy, "position"),

@@ -208,7 +208,8 @@ def estimate_quantisation_step(values: Array) -> float:
     differences = np.diff(np.unique(values[np.isfinite(values)]))
     if not len(differences):
         return 0.0
-    # The quotients may overflow to infinity or NaN. The values are then not rounded
+    # The quotients may overflow to infinity or NaN. The comparison below is then False, so the
+    # values count as not rounded
     with np.errstate(over="ignore", invalid="ignore"):
         step_counts = differences / differences.min()
         rounding_errors = np.abs(step_counts - np.rint(step_counts))

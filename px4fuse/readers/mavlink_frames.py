@@ -229,8 +229,9 @@ def _remove_nested_frames(frames: Int64Array) -> Int64Array:
     for row, (frame_start, frame_end, _) in enumerate(frames.tolist()):
         # The next frame begins at the end of the previous frame, or after its own receive time
         expected_frame_starts = previous_end, previous_end + RECEIVE_TIME_BYTES
-        # Frames after skipped bytes are valid, but a frame that seems to begin inside the receive
-        # time of the next frame is accidental
+        # A frame may also begin after skipped bytes, unless another frame begins at an expected
+        # offset: then its start is accidental, for example inside the receive time of the other
+        # frame
         if frame_start in expected_frame_starts or (
             frame_start >= previous_end and all_frame_starts.isdisjoint(expected_frame_starts)
         ):
@@ -308,7 +309,7 @@ def _count_bytes_outside_frames(
     first_byte = bytes_after_last_frame[receive_time_size_bytes : receive_time_size_bytes + 1]
     is_last_frame_incomplete = (
         0 < len(bytes_after_last_frame) < receive_time_size_bytes + MAX_FRAME_BYTES
-        # Empty if the file ends within the receive time
+        # No first byte if the file ends before or within the bytes of the receive time
         and first_byte in (b"", bytes([MAGIC_BYTE_V1]), bytes([MAGIC_BYTE_V2]))
     )
     return unknown_frame_count, byte_count_outside_frames, is_last_frame_incomplete
@@ -336,7 +337,8 @@ def _measure_unknown_frame(
         )
     else:
         return 0
-    # A frame with a known message has an invalid checksum: the valid frames are not in the gaps
+    # The checksum of each frame with a known message was tested: in a gap between valid frames,
+    # such a frame has an invalid checksum
     is_known = message_id in dialect.mavlink_map
     return 0 if is_known or offset + frame_size_bytes > gap_end else frame_size_bytes
 

@@ -50,9 +50,11 @@ from .px4_positions import (
     unproject,
 )
 
-# Maximum median difference (s) between boot-time GNSS timestamps and receive times
+# GNSS timestamps count as times since boot if their median difference (s) from the receive times is
+# at most this value
 MAX_BOOT_TIME_DIFFERENCE_S = 5.0
-# Maximum time (s) between global and local position for the origin: 5 cm error at 1 m/s
+# Computation of the local NED origin from global and local position: maximum time (s) between both
+# messages; it causes an error of 5 cm at 1 m/s
 MAX_ORIGIN_TIME_DIFFERENCE_S = 0.05
 
 

@@ -105,12 +105,13 @@ def fit_clock_line(x: Array, y: Array) -> ClockLine:
     interval_count = int(np.clip(span_s / CLOCK_FIT_INTERVAL_S, 1, MAX_CLOCK_FIT_INTERVALS))
     interval_starts = np.searchsorted(x, np.linspace(x[0], x[-1], interval_count + 1)[1:-1])
     rows_by_interval = [rows for rows in np.split(np.arange(len(x)), interval_starts) if len(rows)]
-    # First approximation, from any reading of each interval
+    # First approximation of the slope, from the middle reading of each interval
     rows = [interval_rows[len(interval_rows) // 2] for interval_rows in rows_by_interval]
     slope = _fit_clock_rate(x[rows], y[rows])
     if abs(slope - 1.0) <= MAX_RELATIVE_CLOCK_RATE_DIFFERENCE:
         slope = 1.0
-    # Fit the slope twice, because the slope affects which messages have the least delay
+    # Select the reading with the least delay in each interval, three times. After the first two
+    # selections, fit the slope again, because it affects the relative delays
     for fit_number in range(3):
         relative_delay_s = y - slope * (x - x0)
         rows = [
@@ -273,7 +274,8 @@ class Recording:
         if "time_boot_ms" in (table.dtype.names or ()):
             return table["time_boot_ms"] * 1e-3
         timestamp_s: Array = table["time_usec"] * 1e-6
-        # time_usec is boot time or UNIX time; both are valid if the origin has the same clock
+        # time_usec is time since boot or UNIX time. It is used if it is the same kind of time as
+        # time_origin_s; otherwise, the receive time is used
         is_boot_time = (timestamp_s > 0.0) & (
             (timestamp_s < MIN_UNIX_TIME_S) == (self.time_origin_s < MIN_UNIX_TIME_S)
         )
@@ -302,7 +304,8 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
         is_position_in_frame = samples["frame_id"] == frame_number
         is_velocity_in_frame = samples["child_frame_id"] == frame_number
         if frame.is_body_frame:
-            # A position cannot be in the body frame. The conversion of the velocity needs attitude
+            # A position in the body frame is invalid. The conversion of a velocity needs the
+            # attitude
             is_position_in_frame[:] = False
             is_velocity_in_frame &= has_quaternion
         elif min(frame.axis_signs) > 0.0:
@@ -370,7 +373,8 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
         find_longest_increasing_subsequence(np.rint(boot_times_s * 1e6).astype(np.int64)),
     )
     rows, boot_times_s = rows[increasing_time_rows], boot_times_s[increasing_time_rows]
-    # By default, all receive times are zero, and equal to the boot times
+    # Without receive times in the file, the conversion from receive time to boot time changes
+    # nothing. Without any time, all receive times are zero
     receive_times_s = np.zeros(len(frames))
     receive_to_boot_time_fit = ClockLine(0.0, 0.0, 1.0, 0.0, len(rows))
     if frames.receive_times_us is not None:

@@ -106,7 +106,8 @@ def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[Mavl
     rows = np.concatenate([frames.rows(message) for message in AUTOPILOT_MESSAGES])
     addresses_with_autopilot_message = _count_frames(frames, rows)
     candidates = (
-        # A heartbeat is not sufficient, because companion computers may send autopilot heartbeats
+        # Vehicles that also sent another autopilot message: a heartbeat alone does not identify an
+        # autopilot, because companion computers may send heartbeats of an autopilot
         [address for address in vehicle_addresses if address in addresses_with_autopilot_message]
         # Autopilots whose heartbeats are not in the recording
         or [address for address in addresses_with_autopilot_message if address not in vehicle_types]
@@ -185,7 +186,7 @@ def _map_sender_clock(
         )
         rows.append(timesync_rows[is_request])
         timestamps_s.append(request_times_s[is_request])
-    # Replies of the autopilot to this sender: no other sender sent the request
+    # Replies of the autopilot to this sender: no other sender sent the request to which they reply
     all_rows = frames.rows("TIMESYNC")
     other_timesync = frames.table("TIMESYNC", all_rows[~frames.is_sent_by(sender, all_rows)])
     other_requests = other_timesync["ts1"][other_timesync["tc1"] == 0]

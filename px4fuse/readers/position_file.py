@@ -92,7 +92,7 @@ class PositionRecording:
     reason_by_invalid_row: "pd.Series[str]" = field(default_factory=lambda: NO_INVALID_ROWS)
     # Quantisation step of the horizontal position; 0 if not quantised
     quantisation_step_m: float = 0.0
-    # Name of the format; "" for a table with a header
+    # Name of the file format; "" for a table with a header
     format: str = ""
     # Number of rows with the selected rigid body or UWB tag
     row_count: int = 0
@@ -354,7 +354,8 @@ def _select_body(
     for index, meaning in enumerate(column_meanings):
         if meaning.kind == "tag":
             tags = texts[index].dropna().unique().tolist()
-            # A counter has many values: ignore it unless the user gave one of them
+            # A column with many different values is a counter, not a column of tags: ignore it,
+            # unless the user chose a tag
             has_several_tags = 1 < len(tags) <= MAX_TAGS_IN_FILE
             if has_several_tags or (tags and body_name is not None):
                 return texts[texts[index] == choose_body(table.file_name, tags, body_name)]

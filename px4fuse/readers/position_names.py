@@ -103,7 +103,7 @@ def read_column_name(name: str) -> ColumnMeaning:
             split_words.append(word)
     axes = [_AXIS_BY_WORD[word] for word in split_words if word in _AXIS_BY_WORD]
     other_words = [word for word in split_words if word not in _AXIS_BY_WORD]
-    # Positions and σ have at most one axis, and no unknown word
+    # The name of a position or σ column contains at most one axis, no time unit and no unknown word
     is_known = (
         unit not in SECONDS_BY_TIME_UNIT
         and len(axes) <= 1

@@ -56,7 +56,8 @@ VALIDITY_FLAGS = ("xy_valid", "xy_global")
 MAG_3D_FUSION_BIT = 5
 # Minimum rate (Hz) of a complete magnetometer log; EKF2 uses 14 Hz
 MIN_MAGNETOMETER_HZ = 10.0
-# Distance from a half-integer at which the rounding of an interval ratio is ambiguous
+# Number of IMU samples per prediction step = prediction step ÷ IMU interval, rounded. The rounding
+# is ambiguous if the ratio is closer to a half-integer than this value
 MAX_INTERVAL_RATIO_DISTANCE_FROM_HALF_INTEGER = 0.05
 # Maximum interval (s) for the inversion of EKF2's low-pass filter of optical flow
 MAX_FLOW_INTERVAL_S = 0.5
@@ -361,8 +362,8 @@ def _read_fusion_record(
     origin = local_samples.reindex(columns=["ref_lat", "ref_alt"]).ffill().iloc[-1]
     horizontal_columns = Columns.POSITION[:2]
     altitude_m = 0.0
-    # Since v1.16, EKF2 logs zeros for the horizontal position, and altitude as height
-    # (ekf_helper.cpp)
+    # Since v1.16, the horizontal position in estimator_states is zero, and the height is the
+    # altitude above sea level (ekf_helper.cpp)
     if not usable_state[horizontal_columns].to_numpy().any():
         usable_state[horizontal_columns] = np.nan
         altitude_m = float(np.nan_to_num(origin["ref_alt"]))
@@ -452,7 +453,7 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     is_used = (steps_s > 0.5 * interval_s) & (steps_s <= MAX_FLOW_INTERVAL_S)
     if FLOW.name in enabled_aids:
         is_used &= sample_step_function(enabled_aids[FLOW.name], flow.index) > 0.0
-    # The range is infinite if the flow rate is zero
+    # If the flow rate is zero, the range to the ground is infinite: drop the sample
     return flow[is_used].replace(np.inf, np.nan).dropna()
 
 

@@ -17,14 +17,16 @@ MAX_TIME_DIFFERENCE_OF_SAME_FIX_S = 0.01
 MAX_DIFFERENCE_FROM_LOGGED_LATITUDE_DEG = 1.0
 # Possible intervals (s) between the fixes of a GNSS receiver: 4 to 20 fixes per second
 CANDIDATE_FIX_INTERVALS_S = np.arange(0.05, 0.26, 0.0005)
-# Maximum deviation (s) of a logged interval from a multiple of the receiver's interval
+# Maximum deviation (s) of the time between two logged fixes from a multiple of the interval between
+# fixes of the receiver (98th percentile)
 MAX_DEVIATION_FROM_INTERVAL_MULTIPLE_S = 0.006
-# Minimum number of logged fixes to measure the error of the reconstruction
+# Fixes that the log lacks are reconstructed from EKF2's position and innovation. Minimum number of
+# logged fixes to measure the error of reconstructed fixes
 MIN_LOGGED_FIXES = 10
-# The receiver's interval is known if two successive multiples of it each occur at least this number
-# of times in the log
+# Times between logged fixes are multiples of the receiver's interval between fixes. The interval is
+# known if two successive multiples (n and n + 1) each occur at least this number of times
 MIN_LOGGED_INTERVALS_PER_MULTIPLE = 3
-# Maximum RMS error (m) of reconstructed fixes, compared with logged fixes
+# Maximum RMS difference (m) between reconstructed and logged fixes, to use the reconstructed fixes
 MAX_FIX_RECONSTRUCTION_ERROR_M = 0.1
 
 
@@ -41,7 +43,8 @@ def read_unlogged_fixes(
     # A row that is neither fused nor rejected contains no new fix
     position = position[position[["fused", "rejected"]].any(axis=1)]
     fixes = position.drop(columns=["fused", "rejected"]).join(velocity, how="inner").dropna()
-    # If GNSS is not the height reference, EKF2's height contains a bias estimate
+    # Unless GNSS is the height reference, EKF2 corrects the height of a fix by its bias estimate:
+    # use the height only if EKF2_HGT_REF is 1 (GNSS)
     if topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0) == 1.0:
         fixes = fixes.join(height)
     # EKF2 shifts GNSS times by half a prediction interval (estimator_interface.cpp)
@@ -120,7 +123,7 @@ def reconstruct_fixes(
         },
         index=time_index(fix_times_s),
     )
-    # Logged fixes show the error of the reconstruction
+    # A reconstructed fix that is also logged shows the error of the reconstruction
     is_logged = interval_count == 0.0
     previous_fixes = fixes[reconstructed_fixes.columns].to_numpy()[previous_fix_index]
     position_errors_m = (reconstructed_fixes - previous_fixes)[is_logged].dropna().to_numpy()
@@ -154,15 +157,17 @@ def _estimate_receiver_interval(fix_times_s: Array) -> float | None:
     if not np.any(is_possible):
         return None
     longest_interval_s = CANDIDATE_FIX_INTERVALS_S[is_possible].max()
-    # Best fit among the candidates within 10 % of the longest possible interval
+    # Prefer long intervals: choose the candidate with the smallest deviation within 10 % of the
+    # longest possible interval
     is_near_longest = (
         np.abs(CANDIDATE_FIX_INTERVALS_S - longest_interval_s) < 0.1 * longest_interval_s
     )
     best_index = np.argmin(np.where(is_near_longest, percentile_98_of_deviation_s, np.inf))
     interval_multiples = np.round(logged_intervals_s / CANDIDATE_FIX_INTERVALS_S[best_index])
     is_frequent = np.bincount(interval_multiples.astype(int)) >= MIN_LOGGED_INTERVALS_PER_MULTIPLE
-    # Two successive multiples have no common divisor. With a common divisor, such as 2 and 4, the
-    # interval could also be twice as long
+    # The interval is known only if two successive multiples (n and n + 1) are frequent. If all
+    # frequent multiples had a common divisor, such as 2 and 4, the interval could also be twice as
+    # long
     if not np.any(is_frequent[1:] & is_frequent[:-1]):
         return None
     return float(np.median(logged_intervals_s / interval_multiples))

@@ -275,7 +275,8 @@ def _describe_timestamp_clock(published_us: IntArray, sample_timestamps_us: IntA
             median_s = np.median(sample_timestamps_us) * unit_us * 1e-6
             if MIN_VALID_UNIX_TIME_S <= median_s < MAX_VALID_UNIX_TIME_S:
                 return f"UNIX time in {unit}"
-            # The unit µs is correct, so the clock differs from the boot clock
+            # Timestamps that increase at the rate of µs, but are not boot times, are from another
+            # clock
             return "another clock" if unit == "microseconds" else unit
     return "an unknown clock"
 
@@ -476,7 +477,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     if len(unlogged_fixes):
         fixes = pd.concat([fixes, unlogged_fixes]).sort_index()
         interpolated_altitude_count = fixes["altitude_m"].isna().sum()
-        # Copy fields that EKF2's topics do not contain from the previous fix
+        # EKF2's topics lack some fields of a fix: copy these fields from the previous fix
         fixes = fixes.assign(altitude_m=fixes["altitude_m"].interpolate("index")).ffill()
     samples = convert_gnss_fixes(fixes, _find_local_origin(topics))
     rate_hz = compute_sample_rate_hz(samples)
@@ -561,7 +562,8 @@ def read_truth(
             return Truth(global_layout.topic, projected_positions.join(velocity), attitude)
         if has_fused_aid(ekf2):
             local_samples = local_samples.copy()
-            for column in Columns.POSITION:  # both frames differ by a constant
+            # the origins of both frames may differ by a constant offset
+            for column in Columns.POSITION:
                 local_truth_m = interpolate_inside_time_span(
                     projected_positions.index, local_samples[column]
                 )

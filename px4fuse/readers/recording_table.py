@@ -51,7 +51,7 @@ class PositionTable:
     """Table of positions in a file, as text with named columns."""
 
     file_name: str
-    # Name of the format; "" for a table with a header
+    # Name of the file format; "" for a table with a header
     format: str
     column_names: list[str]
     # Text of the rows, without the header
@@ -218,7 +218,8 @@ def find_position_table(
     lines = header_text.split("\n")[:MAX_HEADER_LINES]
     wanted_names = {column.strip().casefold() for column in columns or () if not column.isdecimal()}
     table = None
-    # Columns are chosen by the user only in tables with columns: with a header, or by number
+    # Columns chosen by the user refer to tables with named or numbered columns, not to other
+    # formats
     if columns is None:
         table = (
             _find_json_table(file_name, text)

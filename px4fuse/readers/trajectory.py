@@ -30,16 +30,17 @@ UNIT_NORM_TOLERANCE = 1e-15
 MAX_DROPPED_ROW_FRACTION = 0.01
 # Maximum coordinate (m) and rotation angle (rad) of a first pose that counts as the identity
 MAX_DEVIATION_FROM_IDENTITY = 1e-6
-# A motion is planar if its smallest RMS extent ÷ second largest RMS extent is below this ratio
+# RMS extents of a trajectory along its three principal axes: the motion is planar if the smallest ÷
+# the second largest extent is below this ratio
 MAX_SMALLEST_TO_SECOND_EXTENT_RATIO = 1 / 3
-# A motion is not straight, so that its plane is unique, if its second largest RMS extent ÷ largest
-# RMS extent exceeds this ratio
+# The plane of a motion is unique, because the motion is not along a straight line, if the second
+# largest ÷ the largest RMS extent exceeds this ratio
 MIN_SECOND_TO_LARGEST_EXTENT_RATIO = 0.1
 # Maximum angle (rad) between the normal of the plane of motion and the y axis of a camera frame
 MAX_TILT_RAD = math.radians(20.0)
-# Minimum fraction of intervals near the median interval, for a regular frame rate
+# Regular frame rate of a trajectory: minimum fraction of pose intervals near the median interval
 MIN_REGULAR_INTERVAL_FRACTION = 0.9
-# Maximum relative difference of a regular interval from the median interval
+# A pose interval is near the median interval if it differs by at most this fraction of the median
 MAX_RELATIVE_DEVIATION_FROM_MEDIAN_INTERVAL = 0.5
 # Minimum duration of a gap between two poses ÷ median interval between poses
 MIN_GAP_IN_MEDIAN_INTERVALS = 2.5

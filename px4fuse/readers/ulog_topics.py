@@ -81,7 +81,7 @@ class _ULogContent(io.BytesIO):
     skipped_bytes = 0
     header_start_offset = read_end_offset = position = 0  # byte offsets in the file
 
-    def read(self, size: int, /) -> bytes:  # type: ignore[override]  # pyulog gives a size
+    def read(self, size: int, /) -> bytes:  # type: ignore[override]  # pyulog always gives a size
         start = self.position
         if size == HEADER_BYTES:
             if start != self.read_end_offset:
@@ -167,8 +167,8 @@ class _TolerantULogParser(ULog):  # type: ignore[misc]
     MessageLoggingTagged = staticmethod(_skip_if_short(ULog.MessageLoggingTagged))
 
     def _read_file_data(self, topic_names: Any, read_until: int | None = None) -> None:
-        # If data are appended to the file, pyulog counts the bytes that it reads, to stop before
-        # them. It then has to read the samples itself
+        # A ULog with appended data is read up to the offset read_until. pyulog then counts the
+        # bytes that it reads, so pyulog must also read the samples
         self._file_handle.parser = None if read_until else self
         super()._read_file_data(topic_names, read_until)
 

@@ -49,7 +49,7 @@ SEVERITY_STYLES = {
     "note": "cyan",
     "clean": "bold green",
 }
-# Place where a user types the commands of an action
+# Text before the commands of an action, by the place where the user types them (Action.where)
 PLACE_TEXTS = {
     "": "",
     "shell": "run again: ",
@@ -111,7 +111,7 @@ class Paragraph(NamedTuple):
             return lines
         if not self.plot or len(self.text) + len(self.plot) <= width:
             return [self.text + self.plot]
-        # too narrow for the plot
+        # omit the plot if the line is too narrow
         return [self.text.rstrip()] if self.text.strip() else []
 
 

@@ -31,7 +31,9 @@ from .page import Page, draw_legend_above
 from .style import KF_BAND_COLOUR, TRACK_STYLES, Axes
 
 CURVE_HEIGHT = 170.0  # points
-CURVE_TO_INTERVAL_RATIO = 1.25  # half width of the drawn curve, divided by the 95 % interval
+# Range of the log-likelihood curve on each side of the estimated time offset ÷ width of its 95 %
+# interval
+CURVE_TO_INTERVAL_RATIO = 1.25
 # Faults for which the report has a page on the time offset
 TIME_OFFSET_FINDINGS = ("source_time_offset_changes", "source_time_offset", "ekf2_ev_delay_wrong")
 

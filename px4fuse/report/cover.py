@@ -219,7 +219,8 @@ def _draw_error_plots(page: Page, analysis: Analysis, card: DiagnosisCard, heigh
 def _compute_error_axis_limit_m(error_m: pd.Series[float], sigmas_m: SigmaByFilter) -> float:
     largest_error_m = max(float(error_m.abs().max()), 1e-3)
     sigma_limits_m = [2.2 * sigma.median() for sigma in sigmas_m.values()]
-    # The σ band is larger than the plot if σ is much too large
+    # The error axis ends at 3 times the largest error: if the reported σ is much too large, its
+    # band is cut off, so that the errors remain visible
     return float(np.nanmax([largest_error_m, *np.minimum(sigma_limits_m, 3.0 * largest_error_m)]))
 
 

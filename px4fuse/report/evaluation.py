@@ -82,7 +82,7 @@ def _draw_path(axes: Axes, evaluation: Evaluation, axis_indices: list[int]) -> N
         path_m[::stride, 1],
         c=error_m[::stride],
         s=9.0,
-        cmap="copper_r",  # differs in greyscale too
+        cmap="copper_r",  # its colours also differ in greyscale
         linewidths=0,
         vmin=0.0,
         vmax=max(float(error_m.max()), MIN_DRAWN_ERROR_RANGE_M),

@@ -48,10 +48,12 @@ def write_markdown(page: Page, notes: str) -> None:
 
     parser = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
     next_item_numbers = list[int]()  # number of the next item in each open list, unused for bullets
-    # level: open list items and quotes; marker: bullet or number of a list item without text yet
+    # level: number of open list items and quotations; marker: bullet or number of a list item that
+    # has no text yet
     level, marker, previous_type, table_rows = 0, "", "", list[list[str]]()
     for token in parser.parse(notes):
-        # before level changes, so that the marker of an empty item is indented as the item
+        # compute the indent before this token changes the level: an item without text ends here,
+        # and its marker needs the indent of the item
         indent = INDENT * min(level, MAX_INDENTS)
         if marker and token.type not in ("paragraph_open", "inline"):
             page.write("", indent=indent, marker=marker)  # the item does not begin with a paragraph

@@ -67,8 +67,8 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
         Results that are attached to the PDF as ``results.json``.
     """
     title = results.provenance.command
-    # Analysed file: the log, the odometry ("track") of a loop, or the evaluated trajectory
-    # ("estimate")
+    # Analysed file: the log, the odometry of px4fuse loop ("track"), or the trajectory of px4fuse
+    # evaluate ("estimate")
     fields = (field for field in ("log", "track", "estimate") if hasattr(results, field))
     source = getattr(results, next(fields))
     blocks = list[Any]()

@@ -63,7 +63,7 @@ def list_tuning_advice(
             "not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by ground truth or a loop "
             "closure.",
         )
-    # Same restriction as the finding kf_underconfident of px4fuse compare
+    # As the finding kf_underconfident of px4fuse compare: with GNSS, do not advise a smaller noise
     elif origin.is_gnss and any(
         noise.value is not None and noise.high is not None and noise.high < setting
         for _, noise, setting in noises

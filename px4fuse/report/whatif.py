@@ -50,8 +50,8 @@ def list_statistics(analysis: WhatIfAnalysis) -> Iterator[str]:
         text = replayed_text
         for column in changed_columns:
             changed_text = column.get(label, "n/a")
-            # a common unit or expected NIS is printed once; the expected NIS depends on the number
-            # of samples
+            # remove a unit or an expected NIS that the next text repeats, so that it is printed
+            # once. The expected NIS differs if the number of samples differs
             text = text.removesuffix(f" {changed_text.partition(' ')[2]}") + f" → {changed_text}"
         if replayed_text != "n/a":
             yield f"EKF2 (replay), {label} {text}"

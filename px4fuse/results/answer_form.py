@@ -249,7 +249,8 @@ class FormQuestion(Record):
         return f"{quantity}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
 
 
-# A question about the innovation gate is about one update of KF and this number of later updates
+# A question of the kind "gate" asks which updates are outside the innovation gate, among one update
+# of KF and this number of later updates
 LATER_UPDATE_COUNT_IN_GATE_QUESTION = 20
 
 
@@ -344,14 +345,15 @@ def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
     quantity_fields = [f"q{number}" for number in range(1, len(_QUESTION_KIND_PAIRS) + 1)]
     choice_fields = [f"c{number}" for number in range(1, MAX_CHOICES + 1)]
     unknown_fields = (quantities.keys() - quantity_fields) | (choices.keys() - choice_fields)
-    if "mistakes" in filled_form:  # field of Answers; the name in the form is "mistake"
+    if "mistakes" in filled_form:
+        # Answers has a field "mistakes", but in a form only "mistake" is valid
         unknown_fields.add("mistakes")
     if unknown_fields:
         raise ValueError(
             f"the field {min(unknown_fields)} is unknown; known fields: "
             f"mistake, {', '.join(quantity_fields)}"
         )
-    # a form without answers about figures gives no choices instead of blank choices
+    # Without answers about figures, "choices" is an empty tuple, not a tuple of blank choices
     return {
         **filled_form,
         "mistakes": mistakes,

@@ -109,7 +109,8 @@ def _drop_invalid_values(
         for unavailable_type in list_types(annotation):
             if isinstance(unavailable_type, type) and issubclass(unavailable_type, Unavailable):
                 text_fields = {"what": path, "reason": error.reason, "remedy": CHECK_LOG_REMEDY}
-                # for example the errors of a filter against ground truth, if its NIS is not valid
+                # keep fields that the Unavailable object also has, for example the errors of a
+                # filter against ground truth if its NIS is not valid
                 other_fields = {
                     field.name: _drop_invalid_values(
                         getattr(value, field.name), field.type, path, errors
@@ -159,7 +160,7 @@ def _drop_invalid_entries(
             )
         except _OutOfBoundsError as error:
             errors.append(error)
-    # a mapping that must not be empty, such as the axes, is not valid as a whole
+    # if all entries are invalid, a mapping that must not be empty, such as the axes, is invalid too
     if not checked_elements and any(
         getattr(meta, "min_length", 0) for meta in get_args(annotation)[1:]
     ):

@@ -178,7 +178,7 @@ def simulate_ekf2(
     rules = GNSS_RULES if aid == GNSS_POS else VISION_RULES
     if not int(log_parameters[aid.switch]) & 1:
         # If bit 0 of EKF2_EV_CTRL is not set, EKF2 tests the positions but never fuses them
-        # (ev_pos_control.cpp). A start interval of 0 has this effect
+        # (ev_pos_control.cpp). The same effect: no two positions are close enough to start fusion
         rules = replace(rules, max_sample_interval_to_start_s=0.0)
     # EKF2 delays the fusion by the length of its IMU buffer, in steps (estimator_interface.cpp)
     buffer_length = int(np.ceil(1e3 * settings["EKF2_DELAY_MAX"] / PREDICTION_STEP_US))
@@ -239,12 +239,13 @@ def _make_segment(
     integrated_attitude = cumulative_product(
         np.concatenate([true_quaternions[:1], from_rotation_vector(rotation_rad)])
     )
-    # rotation from the integrated gyro to the true attitude: the model integrates the gyro, and its
-    # attitude corrections keep it at the true attitude
+    # rotation from the attitude integrated from the gyro to the true attitude. Its change in each
+    # step is the attitude correction, which keeps the attitude of the EKF2 model at the true
+    # attitude
     attitude_difference = multiply(true_quaternions, conjugate(integrated_attitude))
     attitude_error_rad = sensors.simulate_attitude_error(scenario, faults, time_s).as_rotvec()
-    attitude_error_rad[:, :HEADING] = 0.0  # EKF2 estimates the tilt itself
-    # measured at time 0, where the vehicle still stands
+    attitude_error_rad[:, :HEADING] = 0.0  # only the heading is measured
+    # IMU measurements at rest, at time 0 before take-off
     specific_force_m_s2, rate_rad_s = sensors.simulate_imu_samples(
         scenario,
         faults,
@@ -357,7 +358,8 @@ def _compute_output(inputs: ReplayInputs, model_run: SegmentRun) -> Ekf2Output:
         -segment.attitude_correction_rad - gyro_bias_rad_s * segment.step_s[:, None]
     )
     gyro_attitude_error_rad = state[0, THETA] + cumulative_sums(attitude_error_increments_rad)
-    # the output predictor then follows the attitude of the fusion horizon, lag_steps later
+    # the output predictor then follows the attitude at the fusion horizon, with a delay of
+    # lag_steps
     attitude_error_rad = gyro_attitude_error_rad + sum_attitude_corrections(
         state[:, THETA] - gyro_attitude_error_rad, lag_steps, inputs.mean_step_s, inputs.horizon_s
     )
@@ -399,7 +401,8 @@ def _hold_position_without_aiding(
     has_recent_position_aiding = (
         time_s - np.maximum.accumulate(time_of_aiding_s) <= NO_AID_TIMEOUT_S
     )
-    # 0 without aiding, so the maximum is the last step with aiding
+    # the product is the number of a step with aiding, and 0 for other steps, so the running maximum
+    # is the last step with aiding
     last_step_with_aiding = np.maximum.accumulate(
         np.arange(len(time_s)) * has_recent_position_aiding
     )
@@ -408,7 +411,8 @@ def _hold_position_without_aiding(
     reset_events = np.flatnonzero(model_run.reset[:, 0])
     reset_steps = events.end_step[reset_events]
     steps_before_reset = reset_steps - 1
-    # a reset moves the estimated or the held position to the measured position
+    # a reset moves EKF2's position to the measured position: from the estimated position with
+    # recent aiding, otherwise from the held position
     reset_sizes_m = np.where(
         has_recent_position_aiding[steps_before_reset, None],
         model_run.innovation[reset_events, 0, HORIZONTAL_POSITION_COLUMNS],

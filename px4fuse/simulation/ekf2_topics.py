@@ -30,9 +30,11 @@ from .sensors import (
 )
 from .ulog_writer import Topic, make_topic
 
-# Rate limit (Hz) of estimator_aid_src_ev_pos on a vehicle (PX4 v1.16, logged_topics.cpp)
+# Rate limit (Hz) at which PX4 logs estimator_aid_src_ev_pos on a vehicle (v1.16, logged_topics.cpp)
 VEHICLE_AID_SOURCE_LOG_RATE_HZ = 2.0
-# Rate limits (Hz) of other topics on a vehicle (PX4 v1.16, logged_topics.cpp)
+# Rate limits (Hz) at which PX4 logs estimator_states, vehicle_local_position,
+# estimator_status_flags and the other estimator_aid_src_* topics on a vehicle (v1.16,
+# logged_topics.cpp)
 STATES_LOG_RATE_HZ = 2.0
 LOCAL_POSITION_LOG_RATE_HZ = 10.0
 FLAGS_LOG_RATE_HZ = 1.0
@@ -147,7 +149,8 @@ def _make_states_topic(
     Its horizontal position is 0, because v1.16 stores latitude and longitude elsewhere.
     """
     end_step = model_run.events[0].end_step
-    # one message for each step with an event
+    # one message for each prediction step with an event: fusion of a position or, in a gap of the
+    # positions, of height and heading
     logged_indices = ekf2_output.find_logged_messages(
         np.diff(end_step, prepend=0) > 0, end_step, STATES_LOG_RATE_HZ
     )
@@ -162,7 +165,7 @@ def _make_states_topic(
         # with a global origin, v1.16 logs the altitude instead of the down position
         states[:, 9] -= HOME_POSITION[2]
     variances = np.zeros((len(logged_steps), 24), np.float32)
-    # the first row of the variances is before the first event
+    # row 0 of the variances is before the first event, so the row after event i is i + 1
     variances[:, : model_run.variance.shape[2]] = model_run.variance[logged_indices + 1, 0]
     return make_topic(
         "estimator_states",
@@ -175,7 +178,8 @@ def _make_position_aid_topics(
 ) -> tuple[Topic, ...]:
     """Make estimator_aid_src_* of the position source, with one message per usable position."""
     events, positions = model_run.events[0], model_inputs.received_positions
-    # an event may occur without a position, or with a position that EKF2 does not use
+    # select events with a position that EKF2 can use: in a gap, an event has no position, and a
+    # position may arrive too late
     logged_indices = ekf2_output.find_logged_messages(events.usable, events.end_step, rate_hz)
     logged_steps, sample_indices = events.end_step[logged_indices], events.sample[logged_indices]
     timestamps = ekf2_output.make_timestamps(logged_steps, events.time_s[logged_indices])
@@ -188,7 +192,7 @@ def _make_position_aid_topics(
     # If EKF2 does not test a position against the innovation gate, it still logs an innovation:
     # measured minus estimated position
     estimated_m = ekf2_output.states_at_fusion_horizon[logged_steps][:, POSITION][:, :2]
-    # the first row of the variances is before the first event
+    # row 0 of the variances is before the first event, so the row after event i is i + 1
     estimate_variance = model_run.variance[logged_indices + 1, 0, HORIZONTAL_POSITION]
     position_noise_variance = noise_variance[:, HORIZONTAL_POSITION_COLUMNS]
     position_innovation = innovation[:, HORIZONTAL_POSITION_COLUMNS]
@@ -242,7 +246,8 @@ def _make_barometer_topics(
     height_samples, end_step = model_run.segment.height_samples, model_run.events[0].end_step
     if height_samples is None or model_run.height_filter is None:
         return []
-    # with step numbers as event times, the column "fused_at_s" contains step numbers
+    # the table gets step numbers instead of times of events, so its column "fused_at_s" contains
+    # step numbers
     updates = model_run.height_filter.make_update_table(BAROMETER.name, 0, end_step.astype(float))
     last_published_step = len(ekf2_output.time_us) - ekf2_output.lag_steps - 1
     # EKF2 does not log the first sample, which only initialises the height
@@ -277,8 +282,8 @@ def _make_magnetometer_topics(
     end_step = model_run.events[0].end_step
     if field is None:
         return []
-    # magnetometer_updates contains, for each event, the rows innovation, innovation variance and
-    # fused fraction of the first configuration
+    # for each event: innovation, innovation variance, and 1 if fused, of the only filter
+    # configuration (index 0)
     updates = model_run.magnetometer_updates[:, :, 0]
     has_sample = np.isfinite(updates[:, 2, 0])
     logged_indices = ekf2_output.find_logged_messages(has_sample, end_step, OTHER_AIDS_LOG_RATE_HZ)
@@ -352,7 +357,7 @@ def _make_flags_topic(
     ]
     last_attempt_s = np.full(len(time_s), -np.inf)
     last_attempt_s[steps_with_fusion_attempt] = time_s[steps_with_fusion_attempt]
-    # the maximum of all earlier attempts is the last attempt
+    # the running maximum of the times of fusion attempts is the time of the last attempt
     time_since_attempt_s = time_s - np.maximum.accumulate(last_attempt_s)
     is_fusing = time_since_attempt_s < model_inputs.rules.stop_timeout_s
     has_changed = np.diff(is_fusing, prepend=False)

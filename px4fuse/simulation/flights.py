@@ -25,7 +25,7 @@ NO_FAULTS = FaultSizes()
 # PX4 v1.16.0, whose topics are simulated, as a version number
 PX4_RELEASE = 1 << 24 | 16 << 16 | 255
 SIMULATION_HARDWARE = "px4fuse simulation"
-# Rate limit (Hz) of vehicle_magnetometer on a vehicle (PX4 v1.16, logged_topics.cpp)
+# Rate limit (Hz) at which PX4 logs vehicle_magnetometer on a vehicle (v1.16, logged_topics.cpp)
 MAGNETOMETER_LOG_RATE_HZ = 2.0
 ANSWER_SCHEMA = {"name": "px4fuse-answer", "version": 1}
 

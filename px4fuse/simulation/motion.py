@@ -230,9 +230,11 @@ def plan_flight(scenario: Scenario, faults: FaultSizes, rng: np.random.Generator
     climb_rate_m_s = min(MAX_CLIMB_RATE_M_S, scenario.altitude_m / 2.0)
     climb_time_s = scenario.altitude_m / climb_rate_m_s
     climb_velocity_m_s = np.array([0.0, 0.0, -climb_rate_m_s])
-    # between the centres of its two ramps, the vehicle moves with the full velocity on average
+    # distance = full velocity × time between the centres of the ramps in which the velocity
+    # increases and decreases
     flight_plan.add_velocity_change(climb_velocity_m_s, CLIMB_RAMP_DURATION_S, climb_time_s)
-    # the horizontal flight begins after half a ramp and a pause
+    # the horizontal flight begins half a ramp and a pause after the centre of the ramp that ends
+    # the climb
     flight_plan.add_velocity_change(
         -climb_velocity_m_s, CLIMB_RAMP_DURATION_S, CLIMB_RAMP_DURATION_S / 2.0 + scenario.pause_s
     )
@@ -292,11 +294,12 @@ def _plan_aisle_passes(flight_plan: _FlightBuilder, scenario: Scenario, speed_m_
     velocity_m_s = speed_m_s * compute_direction(scenario.heading_deg)
     heading_follows_path = scenario.nose_follows_path and speed_m_s > 0.0
     pause_s = max(scenario.pause_s, TURN_ROUND_DURATION_S if heading_follows_path else 0.0)
-    # the first ramp starts now, so its centre is later
+    # the first velocity ramp begins at this time, so its centre is half a ramp later
     flight_plan.ramp_centre_s += SPEED_RAMP_DURATION_S / 2.0
     for pass_index in range(scenario.passes):
         pass_velocity_m_s = velocity_m_s if pass_index % 2 == 0 else -velocity_m_s
-        # the speed of the scenario also sets the time of a flight without motion
+        # without motion, the velocity is 0, but a pass lasts as long as at the speed of the
+        # scenario
         flight_plan.add_velocity_change(
             pass_velocity_m_s, SPEED_RAMP_DURATION_S, scenario.length_m / scenario.speed_m_s
         )
@@ -318,7 +321,7 @@ def _plan_square_laps(
         )
     side_count = 4 * scenario.passes
     previous_velocity_m_s = np.zeros(3)
-    # the first ramp starts now, so its centre is later
+    # the first velocity ramp begins at this time, so its centre is half a ramp later
     flight_plan.ramp_centre_s += SPEED_RAMP_DURATION_S / 2.0
     for side_index in range(side_count):
         velocity_m_s = speed_m_s * compute_direction(scenario.heading_deg + 90.0 * side_index)
@@ -328,7 +331,8 @@ def _plan_square_laps(
             flight_plan.yaw_ramps.append((turn_start_s, CORNER_DURATION_S, np.array([np.pi / 2.0])))
         is_last_side = side_index == side_count - 1
         side_length_m = scenario.length_m - (open_end_m if is_last_side else 0.0)
-        # the speed of the scenario also sets the time of a flight without motion
+        # without motion, the velocity is 0, but a side lasts as long as at the speed of the
+        # scenario
         flight_plan.add_velocity_change(
             velocity_m_s - previous_velocity_m_s,
             ramp_duration_s,

@@ -430,8 +430,8 @@ def simulate_outliers(
         return outlier_error_m, is_outlier
     rng = make_random_generator(scenario, RandomStream.NLOS_OUTLIERS)
     burst_count = math.ceil(outlier_count / MEAN_OUTLIER_BURST_POSITION_COUNT)
-    # lengths of good positions, burst, good positions, ..., burst, good positions; a burst has at
-    # least one outlier
+    # numbers of successive positions: good positions, burst of outliers, good positions, ...,
+    # burst, good positions. A burst has at least one outlier
     run_lengths = np.empty(2 * burst_count + 1, np.intp)
     run_lengths[1::2] = 1 + rng.multinomial(
         outlier_count - burst_count, np.full(burst_count, 1.0 / burst_count)

@@ -143,12 +143,14 @@ class _PdfComparison:
     """Pairwise comparison of all objects of two PDFs."""
 
     is_same_text: TextComparison
-    # pairs of objects that are already compared: number and generation in the submitted PDF, and
-    # number in the redrawn PDF
+    # pairs of PDF objects that are already compared: object number and generation in the submitted
+    # PDF, and object number in the redrawn PDF
     compared_objects: set[tuple[int, int, int]] = field(default_factory=set)
-    # nested values of the current page or entry that are not yet compared
+    # stack of pairs of PDF values that are not yet compared: the current page (or a value compared
+    # after all pages), and values nested in it
     pairs_to_compare: list[_ValuePair] = field(default_factory=list)
-    # pairs that are compared after all pages
+    # pairs of PDF values that are compared after all pages: document information, catalogue, and
+    # parents of pages
     deferred_pairs: list[_ValuePair] = field(default_factory=list)
     # fonts of the current page by name
     fonts: Mapping[str, Any] = field(default_factory=dict)
@@ -215,9 +217,9 @@ class _PdfComparison:
                         _STRUCTURAL,
                     )
                     continue
-                # list.__iter__ does not resolve the references
+                # list.__iter__ does not resolve references to other PDF objects
                 elements = zip(*map(list.__iter__, (submitted_value, redrawn_value)), strict=True)
-                # the last pair of the list is compared first
+                # the last pair of pairs_to_compare is compared first
                 self.pairs_to_compare += reversed([(*pair, key) for pair in elements])
             elif not self._is_same_value(submitted_value, redrawn_value):
                 submitted_text = shorten_to_line(str(submitted_value), 60)
@@ -246,7 +248,7 @@ class _PdfComparison:
                 )
             else:
                 yield f"the PDF lacks an entry {shorten_to_line(name, 40)}", _STRUCTURAL
-        # the last pair of the list is compared first
+        # the last pair of pairs_to_compare is compared first
         for name in sorted(submitted_keys & redrawn_keys, reverse=True):
             # /Parent of a page refers to all other pages, so it is compared after all pages
             (self.deferred_pairs if name == "/Parent" else self.pairs_to_compare).append(
@@ -414,7 +416,7 @@ def _parse_drawing_operations(content: bytes) -> Iterator[Operation]:
         else:
             yield token, tuple(operands)
             operands.clear()
-    # operands without an operator are compared too
+    # operands at the end of a content stream, without an operator, are compared too
     yield "", tuple(operands)
 
 

@@ -179,10 +179,11 @@ def _estimate_inflated_size_bytes(pdf: bytes, start: int, limit_bytes: int) -> i
             break
         try:
             output_bytes += len(decompressor.decompress(chunk, 1_000_000))
-        except zlib.error:  # pypdf will reject this stream
+        except zlib.error:
+            # pypdf will reject this damaged stream
             break
     input_bytes -= len(decompressor.unused_data)
-    # at least 1000 bytes, because each start of the decompression needs time
+    # count at least 1000 bytes for each stream, because each start of the decompression needs time
     return min(max(input_bytes, output_bytes, 1000), limit_bytes + 1)
 
 

@@ -82,7 +82,8 @@ _NUMBER_PATTERN = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
 # Results of the new analysis, and a function that draws the PDF of these results
 RecomputedReport = tuple[ReportedResults, Callable[[], bytes]]
-# Function that links an input file; arguments: file name, SHA-256, label for messages
+# Function that links an input file into a temporary folder and returns the path of the link;
+# arguments: file name, SHA-256, label for messages
 _LinkInputFile = Callable[[str, str | None, str], str]
 
 
@@ -311,7 +312,7 @@ def _compare_with_new_report(
         status = "numbers differ"
     elif page_status == "not compared":
         status = "cannot verify"
-        # the decisive reason is first: some tables show only one reason
+        # the reasons for this status are first, because some tables show only one reason
         reasons = [*page_reasons, values_reason]
     remedy = ""
     if other_libraries:
@@ -388,8 +389,8 @@ def compare_results(
             mismatched_paths.append(path)
         elif recorded_value != new_value:
             unequal_numbers.append((float(recorded_value), float(new_value)))
-    # Compare the texts last: a number printed in a text may differ as a result differs, for example
-    # 0.15 and 0.16 for 0.1549999 and 0.1550001
+    # Compare texts after numbers. A text may contain a number that is within the tolerance, but
+    # rounded to other digits: for example 0.15 for a result of 0.1549999, and 0.16 for 0.1550001
     is_same_number = partial(is_same_number_up_to_rounding, unequal_numbers)
     mismatched_paths += [
         path

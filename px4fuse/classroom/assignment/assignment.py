@@ -162,7 +162,8 @@ def write_assignment(
             for path, content in content_by_path.items()
             if not _exists_with_same_content(path, content)
         }
-        # a figure is never compared: its bytes depend on the version of Matplotlib
+        # the content of an existing figure file is not compared with that of a new figure, because
+        # it depends on the version of Matplotlib
         figures_file = log_file.with_suffix(".png")
         if not figures_file.exists():
             missing_content_by_path[figures_file] = draw_figures(

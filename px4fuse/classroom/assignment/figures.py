@@ -21,7 +21,8 @@ from .random_assignment import draw_scenario_numbers
 FIGURE_COUNT = 3
 # Number of straight passes along the path in each simulated flight
 STRAIGHT_PASS_COUNT = 4
-# Minimum velocity (m/s) in the positive direction of the path for a grey background of the plot
+# Plots of position errors: the background is grey while the velocity (m/s) in the positive
+# direction of the path exceeds this value
 MIN_SPEED_FOR_GREY_BACKGROUND_M_S = 0.2
 # Questions about each figure; the keys are fields of FigureAnswers
 QUESTIONS = {

@@ -49,9 +49,11 @@ CLOSURE_ERROR_TOLERANCE_M = 0.3
 MIN_REJECTED_FRACTION = 0.005
 # Minimum size (m) of an EKF2 position reset that the student must report
 MIN_POSITION_RESET_TO_REPORT_M = 0.2
-# Time (s) at the start in which position resets are ignored: EKF2 resets to its first position
+# Time (s) after the start of the analysed flight in which position resets are ignored: EKF2 resets
+# its position to the first position that it fuses
 INITIAL_TIME_WITHOUT_RESETS_S = 5.0
-# Faults for which a student must ("required") or may ("allowed") report a behaviour of EKF2
+# Behaviour of EKF2 that the answer form must name ("required") or may name ("allowed"), with the
+# injected faults that cause it
 EKF2_BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, str]], "did.toml")
 # Maximum size (bytes) of an answer key: the key of 1000 students has 2 million bytes
 MAX_KEY_BYTES = 20_000_000
@@ -266,7 +268,8 @@ def _make_injected_fault(
         tolerance = CLOSURE_ERROR_TOLERANCE_M
     low, high = size - tolerance, size + tolerance
     if name == "clock-offset":
-        # also accept the estimate of px4fuse, a correction with the opposite sign of the fault
+        # also accept the 95 % interval of px4fuse's estimate. The estimate is the correction of the
+        # timestamps, so its sign is opposite to that of the injected time offset
         _, time_offset = estimate_noises_and_time_offset(comparison)
         if isinstance(time_offset, SourceTimeOffset) and time_offset.is_determinable:
             lowest_correction_s, highest_correction_s = time_offset.interval_s
@@ -328,11 +331,12 @@ def _find_ekf2_behaviours(
     if _has_position_reset(comparison):
         required.append("dead-reckoned, then reset")
     if "never fused" in required:
-        # other behaviours result from this behaviour, so the student need not report them
+        # EKF2 never fused the positions. Its other behaviours are consequences, so the student need
+        # not report them
         required, allowed = ["never fused"], [*required, *allowed]
     elif not required:
         required, allowed = ["normal"], ["followed the positions", *allowed]
-    # list each behaviour once
+    # a behaviour may occur several times in ``allowed``: remove the duplicates
     further_behaviours = [each for each in dict.fromkeys(allowed) if each not in required]
     return tuple(required), tuple(further_behaviours)
 
@@ -355,7 +359,7 @@ def compute_numeric_answer(
     """Run KF to compute the right answer to a question; None with too few measurements."""
     settings = Settings(question.sigma_a_m_s2, question.sigma_z_m)
     kf_run = run_kf(axis_comparison.axis, settings)
-    # the first of these updates is the update of the question
+    # updates from the update that the question is about
     updates = kf_run.updates.iloc[question.update_number - 1 :]
     if updates.empty:
         return None

@@ -247,10 +247,11 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
     if re.sub(r"\W", "", name.casefold()) in NON_STUDENT_ROW_NAMES:
         return None
     numbers = {}
-    # worksheet of Moodle: "Identifier" is "Participant 123"
+    # worksheet of the learning platform Moodle: the column "Identifier" contains "Participant 123"
     if participant := re.search(r"\d+$", sheet.find_cell(row, ("identifier",))):
         numbers["moodle"] = participant[0]
-    # gradebook of Canvas: "ID" is the number of Canvas, and "SIS User ID" is the student id
+    # gradebook of the learning platform Canvas: the column "ID" contains Canvas's number of the
+    # student, and "SIS User ID" contains the student id
     if sheet.find_column_index(("sisuserid", "sisloginid")) is not None:
         if canvas_number := sheet.find_cell(row, ("id",)):
             numbers["canvas"] = canvas_number

@@ -424,7 +424,8 @@ class TimeOffsetItem(RubricItem, tag="clock"):
         if not isinstance(clock, SourceTimeOffset) or not clock.is_determinable:
             reason_text = format_reason(clock.reason or "")
             statement = f"The time offset cannot be estimated from your flight{reason_text}."
-            # the estimate needs motion, but students cannot change an assigned flight: full points
+            # The estimate of the time offset needs motion. Students cannot change the motion in an
+            # assigned flight, so they get full points
             if scoring_input.right_answers is not None:
                 return 1.0, statement
             return self.undeterminable if isinstance(clock, SourceTimeOffset) else 0.0, statement
@@ -449,7 +450,7 @@ class TimeOffsetItem(RubricItem, tag="clock"):
 # ------------------------------------------------------------------ check of a loop
 
 
-# If the vehicle landed farther (m) from the take-off position, a loop closure would be wrong
+# Maximum distance (m) between take-off and landing: with a larger distance, a loop closure is wrong
 MAX_LANDING_DISTANCE_M = 0.5
 CORRECTED_PATH_NAMES: tuple[CorrectionName, ...] = (
     "by_distance_plain",

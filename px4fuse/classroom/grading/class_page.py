@@ -36,7 +36,8 @@ STATUS_STYLES: dict[str, tuple[str, str]] = {
 }
 STATUSES = tuple(STATUS_STYLES)
 TABLE_FILTER_TAGS = (*STATUSES, "pending", "to read", "flagged", "late", "changed by instructor")
-# Minimum number of reports for the correlation of an item with the other items
+# Minimum number of reports to compute the discrimination of a rubric item: the correlation of its
+# points with the points for all other items
 MIN_REPORTS_FOR_CORRELATION = 5
 
 
@@ -207,7 +208,6 @@ def _make_points_cell(grade: Grade) -> Cell:
 
 
 def _make_points_input_boxes(grade: Grade) -> RowDetailsSection:
-    """Make the input boxes for the points that the instructor can enter."""
     report = grade.counted_report
     max_points_by_title = {
         item.title: item.max_points
@@ -219,7 +219,8 @@ def _make_points_input_boxes(grade: Grade) -> RowDetailsSection:
     for title, max_points in max_points_by_title.items():
         override = grade.overrides.get(title, GradeOverride())
         rows.append((title, max_points, override.points, override.comment))
-    # the page writes a complete overrides.csv, also with points that have no input box
+    # the page replaces the whole file overrides.csv, so it must also contain the points for which
+    # the page has no input box
     rows_without_input_box = [
         (title, override.points, override.comment)
         for title, override in grade.overrides.items()
@@ -258,7 +259,8 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
     fault gives one point if the student named it.
     """
     final_reports = [report for report in reports if not report.instructor_action]
-    # points, maximum points and points for all other items of each report
+    # for each title of an item: points, maximum points, and points for all other items, in each
+    # report. The correlation of the points is the discrimination of the item
     scores_by_title = defaultdict[str, list[tuple[float, float, float]]](list)
     for prefix, items_by_report in (
         ("", [report.items for report in final_reports]),

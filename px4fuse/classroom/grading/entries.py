@@ -241,7 +241,9 @@ def _collect_students(
                 student_id = report.student_id
             if student_id:
                 name = report.student.strip() or name
-            else:  # do not use the report: it has no id, or that of another student
+            else:
+                # the report contains no student id, or the id of another student: identify the
+                # student by the login or the number from the learning platform
                 student_id = person.login or " ".join(person.numbers.values())
             person = replace(person, student_id=student_id, name=shorten_to_line(name, 200))
             class_list.people.append(person)
@@ -328,7 +330,6 @@ def _flag_submission(
 
 
 def _choose_counted_report(candidates: Sequence[_CandidateReport], course: Course) -> Grade:
-    """Choose the report that counts for a student's grade."""
     candidates = sorted(candidates, key=lambda each: each.time_s)
     # prefer reports without open decisions of the instructor
     readable = [each for each in candidates if each.report.version]

@@ -26,11 +26,14 @@ from px4fuse.results.answer_form import (
 from ..assignment.key import CorrectFormAnswers, InjectedFault
 from .model import ItemScore
 
-# Fraction of the points for questions about the flight; the rest is for questions about plots
+# If the answer form also has questions about plots of other flights: fraction of the points for
+# questions about the student's own flight. The plots give the other points
 POINTS_FRACTION_OF_FLIGHT_QUESTIONS = 0.2
-# Points deducted for each false fault
+# Points deducted, of 100 points for questions about the flight, for each fault that the student
+# names but that was not injected
 FALSE_FAULT_DEDUCTION = 10.0
-# With this number of false faults or more (guesses), right faults give no points either
+# If a student names at least this number of faults that were not injected (guesses), injected
+# faults that the student names give no points either
 MIN_FALSE_FAULTS_FOR_ZERO_POINTS = 3
 # Score for the answer that names a fault similar to the injected fault
 SCORE_FOR_SIMILAR_FAULT = 0.4
@@ -286,9 +289,11 @@ def _score_faults(matches: list[FaultMatch], right_answers: CorrectFormAnswers) 
         if named_fault is None:
             continue
         size_score = score_fault_size(fault, named_fault)
-        # time, plot and correction of a guessable fault are easy: they need the correct size
+        # a fault in GUESSABLE_FAULT_KINDS can be guessed, and its time, plot and correction follow
+        # from its name. The points for them therefore depend on the stated size
         fault_weight = (size_score if fault.kind in GUESSABLE_FAULT_KINDS else 1.0) / len(matches)
-        # time and plot of a similar fault give half of the points
+        # if the student names a similar fault instead of the injected fault, the right time and
+        # plot give half of the points
         evidence_weight = fault_weight if named_fault.kind == fault.kind else 0.5 * fault_weight
         scores["mistakes"] += score / len(matches)
         scores["fault time and plot"] += score_evidence(fault, named_fault) * evidence_weight
@@ -303,7 +308,8 @@ def score_fault_size(fault: InjectedFault, named_fault: NamedFault) -> float:
     if fault.size is None or fault.low is None or fault.high is None or stated_size is None:
         return 0.0
     if named_fault.kind != fault.kind:
-        # the correct size of a similar fault, such as a time offset, gives a third of the points
+        # if the student names a similar fault instead of the injected fault, a size within the
+        # accepted range gives a third of the points. Both sizes need the same unit
         unit, named_unit = (FAULT_KINDS[each.kind].standard_unit for each in (fault, named_fault))
         return (fault.low <= stated_size <= fault.high and unit == named_unit) / 3.0
     relative_error = abs(stated_size - fault.size) / abs(fault.size)
@@ -384,13 +390,14 @@ def find_accepted_corrections(
         "negated": (-upper_bound, -lower_bound),
         "size": (lower_bound, upper_bound),
         "late milliseconds": (1e3 * lower_bound, 1e3 * upper_bound),
-        # at least twice the injected value
+        # the student must increase a rate to at least twice the injected value
         "twice": (2.0 * size, 1e4),
         # factors on the distances that correct a scale error in per cent
         "factors": (100.0 / (100.0 + upper_bound), 100.0 / (100.0 + lower_bound)),
-        # true noise, with the limits of the verdict "consistent"
+        # position noise that gives the verdict "consistent": 0.8 to 1.25 times the true noise
         "noise": (0.8 * right_answers.sigma_z_m, 1.25 * right_answers.sigma_z_m),
-        # analysis that begins after the fault, or ends before the fault: up to 15 s are lost
+        # start ("after") or end ("before") of an analysis that excludes the fault: it may contain 1
+        # s of the fault, or exclude up to 15 s without the fault
         "after": (fault_end_s - 1.0, fault_end_s + 15.0),
         "before": (fault_start_s - 15.0, fault_start_s + 1.0),
     }

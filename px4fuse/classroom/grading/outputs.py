@@ -60,7 +60,8 @@ GRADES_FOLDER = "grades"
 PSEUDONYMS_FILE = "names.csv"
 QUESTIONS_FILE = "questions.txt"
 PSEUDONYM_TITLES = ("pseudonym", "id", "name")
-# Columns of class.csv before and after the columns of rubric items and numbers
+# Columns of class.csv before and after the columns with the points for rubric items and the columns
+# with numbers from the reports
 TITLES_BEFORE_ITEMS = (
     "file",
     "student",
@@ -93,7 +94,8 @@ HTML_COMMENT_COLUMN_TITLES = ("feedbackcomments", "feedbackalskommentar")
 # Titles of all feedback columns
 COMMENT_COLUMN_TITLES = (*HTML_COMMENT_COLUMN_TITLES, "feedbacktolearner", "feedback", "comment")
 _ASSIGNMENT_NUMBER_PATTERN = re.compile(r" \(\d+\)$")
-# Text in columns that Canvas computes: px4fuse must not change them
+# Text by which the learning platform Canvas marks columns that it computes: px4fuse must not change
+# these columns
 READ_ONLY_TEXT = "(read only)"
 
 
@@ -389,7 +391,8 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
     """
     titles = sheet.column_titles
     short_titles = [_ASSIGNMENT_NUMBER_PATTERN.sub("", title) for title in titles]
-    # Canvas marks the columns that it computes in one of the first rows
+    # Canvas computes some columns. One of the first three rows contains READ_ONLY_TEXT in these
+    # columns
     editable_column_indices = [
         index
         for index in range(len(titles))
@@ -404,8 +407,8 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
         for index in editable_column_indices
         if normalise_text(column_title) in map(normalise_text, (titles[index], short_titles[index]))
     ]
-    # a table of Moodle (with a column "identifier") has only one grade column, so a --column that
-    # matches none of its columns refers to another table
+    # a table of Moodle (with a column "identifier") has only one grade column. If no column of the
+    # table has the title given with --column, --column is meant for another table
     is_moodle_table = sheet.find_column_index(("identifier",)) is not None
     grade_column_index = sheet.find_column_index(GRADE_COLUMN_TITLES)
     if column_title and (matching_indices or not is_moodle_table):

@@ -59,11 +59,13 @@ CLASS_TABLE_NUMBERS = (
     ("closure error (m)", "loop.closure_error_m"),
 )
 
-# Minimum number of equal numbers in the reports of two students for a suspicion of a copy
+# Minimum number of equal numbers in the reports or answer forms of two students for a suspicion of
+# a copy
 MIN_EQUAL_NUMBERS_OF_A_COPY = 3
 # Minimum number of answered multiple-choice questions for comparing two students
 MIN_ANSWERED_CHOICES = 6
-# Maximum relative difference of numbers that count as equal: a copy may have small changes
+# Numbers in the answer forms of two students count as equal if their relative difference is at most
+# this value, because a student may slightly change a copied number
 SAME_NUMBER_RELATIVE_TOLERANCE = 0.02
 # Minimum fraction of the log that a report must analyse
 MIN_ANALYSED_LOG_FRACTION = 0.5

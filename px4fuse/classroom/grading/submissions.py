@@ -171,7 +171,8 @@ def add_submitters(
         if platform := parse_submission_path(submission.name).platform:
             platform_counts_by_export[export][platform] += 1
     for export, submission in zip(exports, submissions, strict=True):
-        # one platform wrote all names of an export, but students may imitate another platform
+        # all files of an export are from one learning platform: assume the platform of most file
+        # names, because students may imitate file names of another platform
         most_common = platform_counts_by_export[export].most_common(1)
         origin = parse_submission_path(submission.name, [platform for platform, _ in most_common])
         if origin.platform in ("gradescope", ""):
@@ -363,11 +364,13 @@ def parse_submission_path(
         if time_text := fields.get("time"):
             try:
                 time = datetime.strptime(time_text, BLACKBOARD_TIME_FORMAT)
-            except ValueError:  # platforms write only valid times: the student chose this name
+            except ValueError:
+                # learning platforms write only valid times, so a student chose this file name
                 continue
         full_name = " ".join(filter(None, map(fields.get, ("name", "first", "last"))))
         numbers = {platform: fields["number"]} if "number" in fields else {}
-        # Moodle and Blackboard add this text once to each path
+        # a learning platform adds the text of _PLATFORM_TEXT_PATTERN only once, and only Moodle and
+        # Blackboard add it: more matches are forged
         platform_text_count = 1 if platform in ("moodle", "blackboard") else 0
         return ExportOrigin(
             platform,
