@@ -74,7 +74,7 @@ def evaluate(log: AidLog, name: str = "gnss_pos") -> AidResult:
     (0.5, "consistent"), (0.58, "consistent"), (0.68, "overconfident"),
     (0.43, "consistent"), (0.37, "underconfident"),
 ])  # fmt: skip
-def test_aiding_source_is_consistent_at_sigma_ratio_0_8_to_1_25(sigma, verdict) -> None:
+def test_aiding_source_is_consistent_at_root_nis_of_0_8_to_1_25(sigma, verdict) -> None:
     aid = evaluate(aid_log(sigma=sigma))
     assert aid.verdict == verdict
     assert aid.nis_mean == pytest.approx((sigma / 0.5) ** 2, rel=0.06)
@@ -207,7 +207,7 @@ def test_unfused_barometer_is_reported_only_with_height_error(
 
 
 @pytest.mark.parametrize(("error_m", "expected_m"), [(0.9, 0.9), (0.2, None)])
-def test_height_error_in_gap_below_3_times_rmse_is_not_reported(
+def test_ekf2_height_error_above_3_times_rmse_is_reported(
     error_m: float, expected_m: float | None
 ) -> None:
     time_s = np.arange(0.0, 60.0, 0.1)
@@ -336,7 +336,7 @@ def test_aiding_source_report_lists_ekf2_instance_changes() -> None:
     assert not find_aid_findings({}, aids_only())
 
 
-def test_missing_heading_alignment_without_positions_is_reported() -> None:
+def test_log_without_positions_reports_unaligned_ekf2_heading() -> None:
     states = {"tilt_align": pd.Series([1.0], [0.0]), "yaw_align": pd.Series([0.0], [0.0])}
     (finding,) = find_aid_findings({}, aids_only(status_flags=states))
     assert finding.id == "ekf2_not_aligned"
@@ -353,7 +353,7 @@ def test_gnss_without_fix_is_reported() -> None:
     assert "none with a 3D fix" in finding.message
 
 
-def test_heading_alignment_action_advises_to_send_orientation() -> None:
+def test_ekf2_heading_advice_without_magnetometer_is_vision_yaw() -> None:
     flight = aids_only(status_flags={"yaw_align": pd.Series([0.0], [0.0])})
     flight.log = log(parameters={"EKF2_EV_CTRL": 9, "EKF2_MAG_TYPE": 5})
     (finding,) = ekf2_state.detect_missing_alignment(flight, SEGMENT, source())

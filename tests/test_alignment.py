@@ -193,7 +193,7 @@ def test_align_position_file_detects_frame_and_time_offset(
     yaw_deg=st.floats(-179.0, 179.0),
     origin_m=st.tuples(*[st.floats(-8.0, 8.0)] * 3),
 )
-def test_align_position_file_recovers_clock_frame_and_yaw(
+def test_align_position_file_recovers_time_offset_frame_and_yaw(
     seed, frame, frame_given, offset_s, yaw_deg, origin_m
 ):
     flight = flight_along(seed=seed)
@@ -210,7 +210,7 @@ def test_align_position_file_recovers_clock_frame_and_yaw(
     assert alignment.misplaced == alignment.warnings == ()
 
 
-def test_position_file_offset_and_yaw_errors_agree_with_sigma() -> None:
+def test_position_file_time_and_yaw_errors_match_reported_sigma() -> None:
     clock, yaw = [], []
     for seed in range(24):
         flight = flight_along(seed=seed, duration_s=60.0)
@@ -344,7 +344,7 @@ def test_align_position_file_of_another_day_gives_warning(flight: Flight) -> Non
 # -- outliers, gaps and resets ---------------------------------------------------------------------
 
 
-def test_align_position_file_with_outliers_and_gap_finds_offset() -> None:
+def test_align_position_file_with_outliers_finds_time_offset() -> None:
     flight = flight_along(uwb=Uwb(outlier_share=0.08, gap_s=(30.0, 48.0)))
     alignment, _ = align(flight, uwb_file(flight), frame="enu", yaw_deg="auto")
     assert clock_error_s(alignment) < 0.03
@@ -417,7 +417,7 @@ def test_align_position_file_at_rest_requires_clock_offset() -> None:
     assert_same_track(track, flight.positions[0], 1e-9)
 
 
-def test_align_position_file_without_imu_needs_offset_and_frame() -> None:
+def test_align_position_file_without_imu_requires_clock_offset() -> None:
     flight = flight_along(imu=None, ekf2=None)
     file = uwb_file(flight)
     said = f"no EKF2 position; the log has no acceleration.*{BOTH_SPANS}.*"
@@ -458,7 +458,7 @@ def test_align_position_file_of_other_flight_is_rejected(flight: Flight) -> None
 
 
 @pytest.mark.parametrize("yaw", [None, "auto"])
-def test_align_position_file_of_periodic_path_requires_offset(yaw: Any) -> None:
+def test_align_position_file_on_periodic_path_needs_clock_offset(yaw: Any) -> None:
     flight = replace(aisle_flight(), log=replace(aisle_flight().log, boot_time_s=BOOT_S))
     file = uwb_file(flight)
     said = r"cannot be estimated: two time offsets that differ by [1-6]0\.\d s fit.*"
@@ -468,7 +468,7 @@ def test_align_position_file_of_periodic_path_requires_offset(yaw: Any) -> None:
     assert alignment.residual_rms_m == pytest.approx(0.11, abs=0.02)
 
 
-def test_align_position_file_warns_of_second_possible_offset() -> None:
+def test_align_position_file_warns_of_second_time_offset() -> None:
     def accelerating_passes(time_s: Array, heading_deg: float, length_m: float) -> Array:
         along = 5.0 * (1.0 - np.cos(2.0 * np.pi * (time_s / 20.0 + time_s**2 / 2e5)))
         return np.stack([along, 0.0 * along, 0.0 * along], axis=1)
@@ -528,7 +528,7 @@ def test_align_position_file_of_sitl_log_recovers_clock_offset(
 
 
 @pytest.mark.slow
-def test_file_aligned_with_delayed_ekf2_is_realigned_with_imu():
+def test_position_file_aligned_to_late_ekf2_is_realigned_to_imu():
     faults = parse_faults(["clock-offset=-0.25", "ekf2-delay=0.001"])
     late = simulate_flight(Scenario(seed=3, passes=4), faults)
     truth = late.truth.samples[Columns.POSITION]

@@ -119,7 +119,7 @@ def test_answer_form_questions_differ_for_each_log() -> None:
         assert found == pytest.approx(by_hand.get(quantity.kind, found), rel=1e-9)
 
 
-def test_right_answer_for_predicted_sigma_equals_closed_form() -> None:
+def test_answer_form_solution_of_predicted_sigma_is_closed_form() -> None:
     """Closed form: P grows by F P Fᵀ + Q in each step of DT."""
     main = compare(aisle_flight(duration_s=60.0)).main
     quantity = next(

@@ -93,7 +93,7 @@ class TestDraw:
             SECRET, "s1", "aisle"
         )
 
-    def test_simulated_assignment_with_known_secret_equals_reference(self):
+    def test_flight_drawn_from_known_secret_seed_has_pinned_scenario(self):
         drawn = assign_random_flight(SECRET, "s1", "aisle", 2)
         scenario = drawn.scenario
         # a loop contains no ground truth, which would show the landing
@@ -138,7 +138,7 @@ class TestDraw:
             for n, one in enumerate(mixed)
         )
 
-    def test_two_faults_in_assignment_flight_are_compatible(self):
+    def test_two_faults_of_assignment_flight_are_both_detectable(self):
         signs = Counter()
         for n in range(300):
             drawn = assign_random_flight(SECRET, f"s{n}", "aisle", 2)
@@ -167,7 +167,7 @@ class TestDraw:
         }
         assert {name for name, positive in signs if not positive} == both
 
-    def test_smallest_assigned_fault_size_is_detected_in_95_percent(self):
+    def test_smallest_assigned_fault_is_found_in_95_percent_of_logs(self):
         """From the limit on, 95 % of the flights of tests/studies/rates.csv have the finding."""
         table = rates()
         table = table[~table.condition.str.contains("outdoor")]
@@ -404,7 +404,7 @@ class TestCommand:
         assert "0 logs written, 2 existed already" in run_checked("simulate", *given).output
         assert "our secret" not in (at / "f_answers.json").read_text(encoding="utf-8")
 
-    def test_simulate_without_secret_stores_new_secret_in_answer_key(self, at):
+    def test_answer_key_of_assignment_contains_new_secret_seed(self, at):
         given = "--assignment", "roster.csv", "-o", "g", "--kind", "loop"
         kept = run_checked("simulate", *given).output
         assert "answer key contains a new secret" in kept

@@ -333,7 +333,7 @@ def test_read_log_drops_single_nan_samples(tmp_path):
 
 @pytest.mark.parametrize("parameter", ["EKF2_EV_DELAY", "EKF2_EVP_GATE"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_read_log_with_non_finite_parameter_keeps_times_finite(tmp_path, parameter, value):
+def test_read_log_with_nan_delay_parameter_gives_finite_times(tmp_path, parameter, value):
     log = make_log("v1.16", 2.0)
     log.parameters[parameter] = value
     flight = read_and_make_axes(log.write(tmp_path / "made.ulg"))

@@ -101,7 +101,7 @@ def test_diagnosis_lists_sensor_fault_before_wrong_parameter() -> None:
         (outcome(0.3, 1.0, 0.29), "nothing"),  # the σ ratio against the source becomes worse
     ],
 )
-def test_filter_rerun_result_shows_if_rmse_or_sigma_improved(after, improves) -> None:
+def test_rerun_is_classified_by_better_rmse_and_reported_sigma(after, improves) -> None:
     assert classify_improvement(trial("noises", after)) == improves
 
 
@@ -115,7 +115,7 @@ def test_setting_without_improvement_in_rerun_is_not_recommended() -> None:
     assert rank_causes(analysis(trial("time offset", FLOWN), fails), [OFFSET]) == []
 
 
-def test_advised_clock_offset_includes_offset_of_position_file() -> None:
+def test_advised_clock_offset_includes_applied_file_clock_offset() -> None:
     flight = analysis(trial("time offset", CORRECTED))
     flight.source.alignment = SimpleNamespace(clock_offset_s=-1795287249.945)
     (ranked,) = rank_causes(flight, [OFFSET])
@@ -134,7 +134,7 @@ def test_diagnosis_without_ground_truth_still_lists_time_offset() -> None:
     assert rank_causes(analysis(trial("noises", outcome(0.98), outcome(1.0))), [NOISE]) == []
 
 
-def test_diagnosis_advises_parameter_of_rerun_with_better_sigma() -> None:
+def test_diagnosis_advises_parameter_that_makes_rerun_consistent() -> None:
     vibration = Finding("ekf2_overconfident", "error", "EKF2 is overconfident.", "Check.", {})
     helps = trial("process noise", CORRECTED, owner="ekf2")
     for trials, commands in (((helps,), ("param set EKF2_ACC_NOISE 0.7",)), ((), ())):
@@ -205,7 +205,7 @@ def test_diagnosis_without_fault_lists_actions_as_optional() -> None:
     assert _format_actions((), (kept_noise,)) == ("Change nothing.",)
 
 
-def test_diagnosis_action_list_omits_actions_without_change() -> None:
+def test_diagnosis_omits_actions_that_advise_no_change() -> None:
     sender = Action("sender", "Remove outliers before sending.")
     kept = Action("EKF2", "keep the settings: EKF2's gate rejects these outliers")
     no_option = Action("KF", "no option makes KF reject outliers")
@@ -216,7 +216,7 @@ def test_diagnosis_action_list_omits_actions_without_change() -> None:
     assert _format_actions((cause,), ()) == ("Sender: remove outliers before sending.",)
 
 
-def test_text_on_changed_sigma_z_names_gnss_noise_parameter() -> None:
+def test_text_on_kf_sigma_z_names_its_default_ekf2_gps_p_noise() -> None:
     gnss = findings_tools.analysis(source=findings_tools.source(origin=GNSS_ORIGIN))
     _, changed = _describe_kf_settings(gnss, ComparisonRequest(log="a.ulg", sigma_z_m=0.1))
     assert changed == ("--sigma-z 0.1 (default from EKF2_GPS_P_NOISE)",)
@@ -226,7 +226,7 @@ def test_text_on_changed_sigma_z_names_gnss_noise_parameter() -> None:
     ("remedy", "target"),
     [("Check EKF2_EV_DELAY.", "EKF2"), ("Correct the timestamps at the sender.", "sender")],
 )
-def test_delay_action_is_assigned_to_ekf2_or_sender(remedy: str, target: str) -> None:
+def test_action_that_names_ekf2_ev_delay_is_assigned_to_ekf2(remedy: str, target: str) -> None:
     delay = findings_tools.made(Finding, id="ekf2_ev_delay_wrong", remedy=remedy)
     assert _find_action_target(delay) == target
 

@@ -29,7 +29,7 @@ def text_of(html: str) -> str:
     return " ".join(unescape(re.sub(r"<[^>]+>", " ", html)).split())
 
 
-def test_diagnosis_html_shows_every_field_of_the_card() -> None:
+def test_diagnosis_html_shows_causes_actions_reruns_and_notes() -> None:
     text = text_of(make_card_html(SMALL_SIGMA_A))
     cause = SMALL_SIGMA_A.causes[0]
     for part in (

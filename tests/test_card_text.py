@@ -29,7 +29,7 @@ def test_sigma_ratio_text_plot_has_marker_at_column_of_ratio(ratio, column, mark
     assert (len(drawn), drawn.index(mark)) == (41, column)
 
 
-def test_sigma_ratio_plot_without_ratio_shows_consistent_range() -> None:
+def test_text_plot_of_missing_sigma_ratio_shows_consistent_range() -> None:
     assert re.fullmatch("1/10 ─{14}░{5}─{14} 10", draw_sigma_ratio(None, "source"))
     assert re.fullmatch("1/10 ─{13}░{7}─{13} 10", draw_sigma_ratio(None, "truth"))
 
@@ -44,7 +44,7 @@ def test_diagnosis_text_has_at_most_40_lines() -> None:
         assert part in whole
 
 
-def test_diagnosis_text_below_98_columns_has_ratios_without_plot() -> None:
+def test_diagnosis_text_below_98_columns_omits_sigma_ratio_plot() -> None:
     card = replace(SMALL_SIGMA_A, causes=())
     wide, narrow = (
         [text for line in card_text.format_card_lines(card) for text in line.wrap(width)]

@@ -31,7 +31,7 @@ def test_fault_table_contains_only_existing_fault_names() -> None:
     assert listed | set(EFFECTS_BY_CAUSE) <= set(FINDING_TITLES)
 
 
-def test_consequences_toml_lists_effect_before_its_cause() -> None:
+def test_fault_table_lists_each_fault_after_its_effects() -> None:
     outer = list(EFFECTS_BY_CAUSE)
     for at, cause in enumerate(outer):
         assert set(find_effect_ids(cause)) & set(outer) <= set(outer[:at]), cause
@@ -94,7 +94,7 @@ def test_consistency_notes_list_innovations_that_are_correlated(sample: Analysis
     assert "KF along down, lag-1 autocorrelation" in white
 
 
-def test_each_page_with_nis_band_defines_consistent_filter(sample: Analysis) -> None:
+def test_each_report_page_on_mean_nis_defines_consistent_filter(sample: Analysis) -> None:
     pages = [Page(), *consistency.draw_pages(sample, None)]
     terminal._write_details(pages[0], sample, SimpleNamespace(findings=()))
     assert all(

@@ -113,7 +113,7 @@ def level_signals(
     return make_segment_motion(imu, attitude_table(time, spoiled), (0.5, 19.0))
 
 
-def test_imu_error_sensitivities_at_rest_equal_closed_form() -> None:
+def test_velocity_per_imu_error_at_rest_equals_closed_form() -> None:
     signals = level_signals()
     t, g = signals.time_s - signals.time_s[0], GRAVITY[2]
     motion = np.moveaxis(signals.motion_and_imu_error_derivatives, -1, 0)
@@ -147,7 +147,7 @@ def test_imu_integration_at_constant_yaw_rate_gives_a_circle() -> None:
     np.testing.assert_allclose(velocity[:, :2], speed, atol=1e-4)
 
 
-def test_integrated_constant_acceleration_equals_closed_form() -> None:
+def test_imu_motion_at_constant_acceleration_equals_closed_form() -> None:
     """Sideways acceleration s over dt gives s dt²/2 and s dt at every offset in each stretch."""
     time, stamps = np.arange(0.0, 80.0, 0.01), np.arange(0.0, 80.0, 0.25)
     still = np.zeros((len(time), 3))
@@ -324,7 +324,7 @@ def test_time_offset_sigma_equals_width_of_likelihood_parabola() -> None:
 
 
 @pytest.mark.parametrize("offset_s", [0.0, -0.2, -0.21, 0.333])
-def test_time_offset_maximises_likelihood_sum_of_flight_parts(offset_s) -> None:
+def test_time_offset_of_each_flight_part_has_maximum_likelihood(offset_s) -> None:
     """Use parabolas as profiles of the parts."""
     shift, sigma = np.array([-0.05, 0.025, 0.0, 0.0]), np.array([0.03, 0.02, 0.03, 0.5])
 
@@ -527,7 +527,7 @@ def stated(
         (KEPT_BY_EKF2_ORIGIN, True),
     ],
 )
-def test_vision_source_with_orientation_is_treated_as_drifting(origin, drifts) -> None:
+def test_vision_odometry_is_marked_as_source_that_may_drift(origin, drifts) -> None:
     samples = pd.DataFrame(np.arange(15.0).reshape(5, 3), np.arange(5.0), Columns.POSITION)
     fields = {"description": "", "frame": "NED", "clock": "", "topics": ()}
     assert make_track("a", samples, origin, is_odometry=True, **fields).origin.may_drift is drifts
@@ -546,7 +546,7 @@ def test_time_offset_interval_widens_if_flight_parts_differ() -> None:
     assert found.is_determinable
 
 
-def test_time_offset_interval_is_not_widened_if_parts_agree() -> None:
+def test_time_offset_interval_is_kept_if_flight_parts_agree() -> None:
     found = widen_for_scatter(stated(0.01, -0.01, 0.015, -0.02, 0.0), "the positions drift")
     assert (found.interval_s, found.sigma_s) == (pytest.approx((-0.021, 0.019)), 0.01)
 

@@ -16,7 +16,7 @@ COORDINATE = st.floats(-50.0, 50.0)
 
 
 @given(st.lists(st.tuples(COORDINATE, COORDINATE), min_size=3, max_size=30, unique=True))
-def test_loop_correction_is_error_times_fraction_of_distance(
+def test_loop_correction_is_closure_error_times_path_fraction(
     odom: list[tuple[float, float]],
 ) -> None:
     err = (odom[-1][0] - odom[0][0], odom[-1][1] - odom[0][1])
@@ -89,7 +89,7 @@ def test_camera_frame_positions_are_converted_to_frd() -> None:
     np.testing.assert_allclose(nose, [0.0, 1.0, 0.0], atol=1e-12)
 
 
-def test_enu_positions_are_converted_to_ned() -> None:
+def test_loop_trajectory_in_enu_is_converted_to_ned() -> None:
     position = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0], [1.0, 2.0, 4.0]])
     given = Trajectory("m", "truth", np.arange(3.0), position, None, "ENU")
     found = closure.to_z_down(given)

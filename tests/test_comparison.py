@@ -55,7 +55,9 @@ def true_errors(flight: Flight, frame: pd.DataFrame, column: str) -> Array:
 
 
 class TestSample:
-    def test_ekf2_mean_nis_equals_logged_test_ratios(self, sample, sample_flight) -> None:
+    def test_ekf2_mean_nis_is_mean_test_ratio_times_gate_squared(
+        self, sample, sample_flight
+    ) -> None:
         """PX4 logs the test ratio ν² / (gate² S) with the opposite sign of ν."""
         segment = sample.segment
         for name in ("north", "east"):
@@ -90,7 +92,7 @@ class TestSample:
                 reported = np.interp(error.index, column.index, column, np.nan, np.nan)
                 assert nees == pytest.approx(np.nanmean(error**2 / reported))
 
-    def test_ekf2_fusion_horizon_position_is_position_before_update(
+    def test_ekf2_fusion_horizon_position_is_before_vision_update(
         self, sample, sample_flight, sample_log
     ):
         """Published positions include the output predictor's lag, which no variance contains."""
@@ -123,7 +125,7 @@ class TestSample:
             assert found.nees_velocity_mean == pytest.approx(np.mean(ev**2 / vv), rel=1e-9)
 
 
-def test_position_source_of_kind_vio_is_treated_as_drifting(sample_flight: Flight) -> None:
+def test_compare_with_source_kind_vio_assumes_position_drift(sample_flight: Flight) -> None:
     plain = compare(sample_flight)
     for kind, drifts, slow in (
         ("uwb", False, False), ("vio", True, False), ("mocap", False, False), ("gnss", False, True),
@@ -139,7 +141,7 @@ def test_position_source_of_kind_vio_is_treated_as_drifting(sample_flight: Fligh
 
 class TestSimulatedFlight:
     @pytest.mark.parametrize("nis", [0.01, 1.0, 20.0])
-    def test_ekf2_sigma_ratio_equals_simulated_ratio(self, nis: float) -> None:
+    def test_ekf2_sigma_ratio_is_root_of_simulated_mean_nis(self, nis: float) -> None:
         comparison = compare(aisle_flight(ekf2=Estimator(nis=nis)))
         assert comparison.horizontal.get("ekf2").sigma_ratio == pytest.approx(nis**0.5, rel=0.05)
 
@@ -267,7 +269,7 @@ class TestMissingParts:
 
 
 class TestRobustness:
-    def test_compare_removes_ekf2_frame_reset_and_adds_note(self, made: Comparison) -> None:
+    def test_compare_removes_ekf2_position_reset_and_adds_note(self, made: Comparison) -> None:
         reset = Reset(60.0, "position", (5.0, -3.0, 0.0))
         comparison = compare(aisle_flight(ekf2=Estimator(resets=(reset,))))
         assert any(

@@ -52,7 +52,7 @@ def test_white_innovations_have_verdict_consistent() -> None:
 
 
 @pytest.mark.parametrize("factor", [0.05, 0.5, 2.0, 90.0])
-def test_sigma_ratio_is_proportional_to_inverse_root_of_s(factor: float) -> None:
+def test_sigma_ratio_scales_as_1_over_root_innovation_variance(factor: float) -> None:
     variance = np.random.default_rng(2).uniform(0.5, 2.0, 2000)
     result = assessed(white(1, 2000) * np.sqrt(variance), factor * variance)
     assert result.sigma_ratio == pytest.approx(factor**-0.5, rel=0.04)
@@ -84,7 +84,7 @@ def test_innovation_statistics_equal_direct_computation() -> None:
     assert [result.bias_t, result.bias_p] == pytest.approx([student.statistic, student.pvalue])
 
 
-def test_fraction_of_innovations_outside_gate_depends_on_gate() -> None:
+def test_innovations_outside_gate_of_3_sigma_are_counted() -> None:
     nu = np.repeat([0.5, 2.5, 4.0, 6.0], 5)
     result = Consistency.from_innovations(nu, np.ones(20), gate=3.0)
     assert (result.fraction_outside_two_sigma, result.fraction_outside_gate) == (0.75, 0.5)

@@ -154,7 +154,7 @@ def test_frame_detection_finds_yaw_rotation_of_positions(rotation_deg):
     assert (total - rotation_deg + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=4.0)
 
 
-def test_source_rotation_is_relative_to_gnss_if_heading_is_wrong():
+def test_vision_rotation_refers_to_gnss_if_ekf2_heading_is_wrong():
     attitude = flown().attitude.copy()
     attitude[Columns.QUATERNION] = multiply(yaw(-14.0), attitude[Columns.QUATERNION].to_numpy())
     gnss = replace(sent(flown(), late_s=0.2, sigma_m=0.3, seed=2), origin=GNSS_ORIGIN)
@@ -165,7 +165,7 @@ def test_source_rotation_is_relative_to_gnss_if_heading_is_wrong():
 
 
 @pytest.mark.parametrize("clock_drift", [-0.04, -0.01, 0.02])
-def test_frame_detection_finds_clock_drift_of_source(clock_drift):
+def test_frame_detection_also_estimates_position_clock_drift(clock_drift):
     found = determine_source_convention(flown(), sent(flown(), clock_drift=clock_drift, late_s=1.0))
     assert_found(found, clock_drift=clock_drift)
 
@@ -284,7 +284,7 @@ AMBIGUOUS = Convention(
 
 
 @pytest.mark.parametrize(("name", "kind"), CONVENTION_FAULTS)
-def test_wrong_axes_unit_or_clock_is_the_only_reported_fault(name, kind):
+def test_wrong_position_convention_is_the_only_reported_fault(name, kind):
     found = list(source_convention.detect(compared(CONVENTION_FAULTS[name, kind](flown()))))
     assert [(one.id, one.evidence[WRONG_CONVENTION_KEY]) for one in found] == [(name, kind)]
 
@@ -336,7 +336,7 @@ def fused(flight: Flight) -> Flight:
     ),
     (("west", "north", "down"), -32.0, ConventionFaults()),
 ])  # fmt: skip
-def test_no_rotation_fault_if_vision_yaw_defines_ekf2_heading(axes, rotation_deg, expected):
+def test_vision_rotation_is_no_fault_if_ekf2_fuses_vision_yaw(axes, rotation_deg, expected):
     convention = Convention(
         verdict="determined", **dict(zip("xyz", axes, strict=True)), rotation_deg=rotation_deg,
         heading_from="gyroscopes", orientation=OrientationConvention(verdict="determined",
@@ -345,14 +345,14 @@ def test_no_rotation_fault_if_vision_yaw_defines_ekf2_heading(axes, rotation_deg
     assert find_convention_faults(convention, fused(flown()), "NED") == expected
 
 
-def test_positions_in_frd_frame_have_no_yaw_fault():
+def test_yaw_rotation_of_positions_in_frd_is_not_a_fault():
     convention = Convention(verdict="determined", x="west", y="north", rotation_deg=-32.0)
     assert not find_convention_faults(convention, flown(), "FRD")
     assert find_convention_faults(convention, flown(), "NED").rotation_deg == pytest.approx(58.0)
 
 
 @pytest.mark.parametrize(("estimate_s", "reported_s"), [(-0.55, 0.55), (-0.48, 0.52)])
-def test_late_timestamps_finding_has_maximum_likelihood_offset(estimate_s, reported_s):
+def test_late_timestamps_report_states_maximum_likelihood_delay(estimate_s, reported_s):
     late = Convention(verdict="determined", late_s=0.52)
     comparison = replace(compared(sent(flown())), convention=late)
     clock = SourceTimeOffset(
@@ -369,7 +369,7 @@ def test_late_timestamps_finding_has_maximum_likelihood_offset(estimate_s, repor
 @pytest.mark.parametrize(
     ("late_s", "expected"), [(0.003, "correct"), (-0.3, "0.30 s early"), (0.3, "0.30 s late")]
 )
-def test_clock_drift_finding_states_if_timestamps_are_late(late_s: float, expected: str) -> None:
+def test_clock_drift_report_states_if_timestamps_are_late(late_s: float, expected: str) -> None:
     drifting = Convention(verdict="determined", late_s=late_s, clock_drift=0.02)
     comparison = replace(compared(sent(flown())), convention=drifting)
     (found,) = source_convention.detect(comparison)
@@ -390,7 +390,7 @@ def test_low_pass_filtered_positions_are_not_reported_as_late(time_constant_s: f
     assert delayed.late_s == pytest.approx(time_constant_s, abs=0.1)
 
 
-def test_note_on_clock_offset_auto_states_applied_time_offset():
+def test_compare_note_on_automatic_clock_offset_states_its_value():
     late = replace(flown(), positions=(sent(flown(), late_s=0.7),))
     request = ComparisonRequest(log="made", clock_offset_s="auto", axes=("north", "east"))
     prepared = prepare_comparison(late, request)
@@ -421,7 +421,7 @@ def test_position_file_in_wrong_frame_report_names_true_frame(axes, message, rem
     assert remedy in found.remedy
 
 
-def test_ekf2_finding_due_to_wrong_axes_names_axes_as_cause():
+def test_ekf2_rejection_report_names_wrong_axes_as_cause():
     comparison = compared(sent(flown(), ENU))
     roots = list(source_convention.detect(comparison))
     other = finding("error", "ekf2_rejects_positions", "EKF2 rejects 9 %. Why.", "Set a gate.")
@@ -431,7 +431,7 @@ def test_ekf2_finding_due_to_wrong_axes_names_axes_as_cause():
     assert (effect.caused_by, effect.message) == ("source_axes_wrong", "EKF2 rejects 9 %.")
 
 
-def test_time_offset_is_not_reported_beside_clock_drift():
+def test_time_offset_is_not_reported_if_clock_drift_is_reported():
     comparison = compared(sent(flown(), clock_drift=0.02))
     roots = list(source_convention.detect(comparison))
     rest = finding("warning", "source_time_offset", "Late.", "Run again.")
@@ -458,7 +458,7 @@ def test_frame_detection_on_recorded_logs_finds_known_frame(name):
     assert_found(determine_source_convention(flight, track), **expected)
 
 
-def test_convention_check_without_heights_keeps_horizontal_data() -> None:
+def test_frame_detection_without_heights_keeps_north_and_east() -> None:
     flight = simulate_flight(Scenario(seed=5), parse_faults(["no-vvo"]))
     prepared = prepare(flight)
     assert prepared.source.samples[Columns.POSITION[:2]].notna().all(axis=None)

@@ -71,7 +71,7 @@ def test_event_symbols_in_plots_are_labelled_by_event_type(eventful: Analysis) -
     assert set(axes.lines[1].get_xdata()) <= set(panels.find_outlier_times(eventful))
 
 
-def test_zoomed_plot_shows_updates_in_middle_of_flight() -> None:
+def test_zoomed_plot_shows_kf_updates_in_middle_of_flight() -> None:
     comparison = compare(aisle_flight(duration_s=120.0))
     start, end = flight.find_zoom_span(comparison.main)
     updates = comparison.main.kf_run.updates.index

@@ -36,7 +36,7 @@ def text_of(card: DiagnosisCard) -> str:
     return " ".join(" ".join(set_by_typst(page_of(card))).split())
 
 
-def free_height(card: DiagnosisCard) -> float:
+def measure_free_height(card: DiagnosisCard) -> float:
     """Return the height (points) between a text below the card and the foot of the sheet."""
     page = page_of(card)
     page.write("after the card")
@@ -118,7 +118,7 @@ def test_report_cover_shows_3_notes_and_counts_the_others() -> None:
 )  # fmt: skip
 def test_report_cover_leaves_no_space_for_empty_text(field: str, empty: Any) -> None:
     card = replace(SMALL_SIGMA_A, reconcile="The two verdicts differ.")
-    heights = [free_height(each) for each in (card, replace(card, **{field: empty}))]
+    heights = [measure_free_height(each) for each in (card, replace(card, **{field: empty}))]
     assert heights[1] > heights[0] + 8.0
 
 
@@ -151,7 +151,7 @@ def test_report_cover_contains_reason_of_missing_verdict() -> None:
     assert "error ÷ σ (ground truth) not evaluated: no ground truth" in text_of(card)
 
 
-def test_report_cover_lists_sigma_ratios_of_aiding_sources() -> None:
+def test_report_cover_lists_consistency_of_aiding_sources() -> None:
     aids = (
         AidConsistency(label="barometer", component="height", ratio=0.57, is_usual=True),
         AidConsistency(label="magnetometer", component="x", ratio=None),

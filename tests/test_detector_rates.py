@@ -36,7 +36,7 @@ def test_false_alarm_rate_on_clean_flights_is_at_most_2_percent() -> None:
 
 
 @pytest.mark.parametrize("finding", sorted({condition.finding for condition in CONDITIONS}))
-def test_simulated_fault_is_top_finding_on_95_percent_of_logs(finding) -> None:
+def test_simulated_fault_is_reported_first_on_95_percent_of_logs(finding) -> None:
     rows = TABLE[(TABLE["finding"] == finding) & (TABLE["condition"] != CLEAN)]
     assert rows["rate" if finding in CONSEQUENCES else "first"].max() >= 0.95
 
@@ -49,7 +49,7 @@ def test_detection_rate_of_undetectable_faults_is_at_most_0_1() -> None:
         assert row.rate <= 0.1
 
 
-def test_clock_jump_is_detected_despite_likelihood_rounding() -> None:
+def test_clock_jump_is_found_despite_numerical_rounding_errors() -> None:
     """Time-correlated error of 10 m, SIGMA_Z 1 mm, an interval of 0.5 ms between two positions."""
     jump = Condition("source_time_offset_changes", "--mistake clock-jump=400ms")
     assert found(FAULTY_SEED + 2, jump)[0] == "source_time_offset_changes"

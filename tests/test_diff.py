@@ -89,7 +89,7 @@ def test_diff_of_two_clean_flights_lists_no_worsened_verdict(clean):
     assert list_changes(clean, clean).numbers == ()
 
 
-def test_diff_of_sigma_z_reports_95_percent_intervals(clean):
+def test_diff_of_estimated_measurement_noise_reports_intervals(clean):
     found = list_changes(clean, flown(502, sigma_uwb_m=0.2))
     (sigma_z,) = [one for one in found.numbers if one.path == "tuning.horizontal.sigma_z_m"]
     assert sigma_z.label == "SIGMA_Z estimate, horizontal"

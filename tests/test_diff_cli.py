@@ -90,7 +90,7 @@ def test_diff_accepts_report_with_aiding_sources_only(tmp_path):
 # -- bad input -------------------------------------------------------------------------------------
 
 
-def test_diff_of_same_file_or_without_results_is_rejected(settings, tmp_path):
+def test_diff_of_file_with_itself_or_without_results_is_rejected(settings, tmp_path):
     usual = settings[0]
     link, printed, text = tmp_path / "link.pdf", tmp_path / "printed.pdf", tmp_path / "notes.txt"
     link.symlink_to(usual)
@@ -120,7 +120,7 @@ def test_diff_of_same_file_or_without_results_is_rejected(settings, tmp_path):
         assert said in error_line("diff", a, b, "--json", "-")
 
 
-def test_diff_without_axis_of_largest_motion_prints_first_axis(settings):
+def test_diff_of_logs_without_main_axis_prints_the_first_axis(settings):
     found = px4fuse.diff(*settings)
     numbers = [replace(one, path=one.path.replace("aisle", "north")) for one in found.numbers]
     numbers.append(replace(numbers[0], path="log.duration_s", label="Duration"))

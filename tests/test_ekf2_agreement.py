@@ -106,7 +106,7 @@ def agreeing(
     (agreeing(0.5, nis=1.26), 0.1, 0.1, False, "mean NIS differs by 26%"),
     (agreeing(0.5, nis=0.74), 0.1, 0.1, False, "mean NIS differs by 26%"),
 ])  # fmt: skip
-def test_ekf2_replay_agrees_if_differences_are_below_limits(
+def test_ekf2_replay_agrees_with_log_if_differences_are_small(
     axis, logged, replayed_share, good, expected
 ):
     for axes in ({"north": axis, "east": agreeing()}, {"north": agreeing(), "east": axis}):
@@ -119,7 +119,7 @@ def test_ekf2_replay_agrees_if_differences_are_below_limits(
     (agreeing(0.949), False), (agreeing(s=1.051), False), (agreeing(published_m=0.29), True),
     (agreeing(published_m=0.31), False),
 ])  # fmt: skip
-def test_ekf2_replay_agreement_is_tested_with_logged_rejections(axis, good):
+def test_ekf2_replay_with_logged_rejections_decides_on_agreement(axis, good):
     """The replay with logged rejections overrides the other verdict, good or bad."""
     own_gate = ReplayAgreement(
         north=agreeing(0.5), east=agreeing(0.5), ev_pos={}, samples=50,
@@ -146,7 +146,7 @@ def test_ekf2_replay_agreement_is_tested_with_logged_rejections(axis, good):
     assert "rejected 51% of the positions and relied on the IMU" in refused.reason
 
 
-def test_ekf2_replay_agreement_statistics_equal_their_formulas():
+def test_ekf2_replay_minus_log_statistics_equal_closed_form():
     s_log = np.full(101, 4.0)
     s = np.linspace(4.0, 8.0, 101)
     nu_log = np.tile([2.0, -2.0], 51)[:101]
@@ -234,7 +234,7 @@ def compared(
     return compare_with_log(SimpleNamespace(ekf2=ekf2), replay)  # type: ignore[arg-type]
 
 
-def test_ekf2_replay_agreement_requires_20_varying_innovations():
+def test_ekf2_replay_agreement_with_log_needs_20_innovations():
     found = compared(20)
     assert found.samples == 20
     assert found.good
@@ -246,12 +246,12 @@ def test_ekf2_replay_agreement_requires_20_varying_innovations():
     assert "are constant" in same.reason
 
 
-def test_ekf2_replay_agreement_without_state_is_unavailable():
+def test_replay_agreement_without_logged_state_is_unavailable():
     assert isinstance(unknown := compared(20, states=1), Unavailable)
     assert unknown.reason == "EKF2's position is not logged in the replayed time"
 
 
-def test_ekf2_innovations_of_only_one_axis_are_not_used():
+def test_ekf2_innovations_logged_on_only_one_axis_are_dropped():
     frame = pd.DataFrame({"innovation_m": [0.1], "innovation_variance_m2": 0.1, "rejected": 0.0})
     for other in (NONE, frame.assign(rejected=np.nan)):
         ekf2 = made(

@@ -201,7 +201,7 @@ def test_ekf2_replay_selects_the_most_complete_vision_topic(tracks, expected):
     assert getattr(found, "name", None) == expected
 
 
-def test_vision_positions_in_frd_are_rotated_with_variance():
+def test_vision_positions_in_frd_are_rotated_to_ned():
     """Published heading 90°, sent 0°: sent north is east."""
     time = 10.0 + 0.1 * np.arange(30)
 
@@ -270,7 +270,7 @@ def test_logged_rejections_are_matched_by_measurement_time():
         assert not reset.any()
 
 
-def test_logged_fusion_is_derived_from_time_of_last_fusion():
+def test_logged_rejections_are_derived_from_last_fusion_time():
     """Rows at 0.5 and 1 s of samples at 10 Hz; EKF2 fused at 0.2 s and reset its position at 1.3 s.
 
     Inertial dead reckoning lasts from 1.2 s, which is 1 s after the last fusion, to 1.3 s.
@@ -352,7 +352,7 @@ def turning(states: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame, Ekf2, Fusio
     return imu, attitude, made(Ekf2, state=state), record
 
 
-def test_ekf2_replay_inputs_equal_motion_of_rotating_vehicle():
+def test_ekf2_replay_imu_input_equals_motion_of_turning_vehicle():
     flown = turning(10.0 + 0.1 * np.arange(21))
     found = _make_segment(*flown, 5, 11.5)
     steps = 10.5 + 0.01 * np.arange(101)

@@ -70,7 +70,7 @@ def test_ekf2_replay_of_flights_with_rejections_agrees_with_log(shared_logs, nam
     assert min(correlations) > REJECTING_FLIGHTS[name]
 
 
-def test_replay_disagrees_if_ekf2_rejected_most_positions(shared_logs):
+def test_ekf2_replay_differs_from_log_with_86_percent_rejections(shared_logs):
     """EKF2 rejects 86 % of the positions, and its variance is reduced by unlogged samples."""
     model = prepare_ekf2_model(read_log(shared_logs / "conventions" / "nwu_vio.ulg"))
     assert not isinstance(model, Unavailable)
@@ -88,7 +88,7 @@ def test_replay_disagrees_if_ekf2_rejected_most_positions(shared_logs):
         ("g1_base", {}),
     ],
 )
-def test_what_if_without_set_option_proposes_wrong_parameter(shared_logs, name, expected):
+def test_what_if_without_set_option_corrects_wrong_parameter(shared_logs, name, expected):
     log = str(shared_logs / "flown" / f"{name}.ulg")
     found = run_what_if(WhatIfRequest(log=log)).changes
     assert found == pytest.approx(expected, abs=20.0 if "d0" in name else 0.01)

@@ -223,7 +223,7 @@ def test_ekf2_model_fuses_vision_height_if_enabled(model: Ekf2Model, sample_flig
     assert abs(own.mean() - vision.mean()) > 0.4
 
 
-def test_ekf2_model_with_constant_accelerometer_bias_is_finite(sample_flight: Flight) -> None:
+def test_ekf2_replay_with_zero_bias_variance_is_finite(sample_flight: Flight) -> None:
     record = sample_flight.ekf2.record
     fixed = record.delayed_state.copy()
     fixed.loc[:, [name for name in fixed if str(name).endswith("m2_s4")]] = 0.0

@@ -82,7 +82,7 @@ def test_vision_measurements_apply_lever_arm_and_noise_minimum():
     np.testing.assert_allclose(noise[0, :, 3:], [[0.01, 0.01, 0.01], [1e-4, 1e-4, 1e-4]])
 
 
-def deciding(
+def decide_gnss_fusion(
     *,
     action: int = FUSE,
     can_start_fusion: bool = False,
@@ -136,7 +136,7 @@ def deciding(
     ({"logged": 0.0}, (True, False, False, 9.5, False, 5)),
 ])  # fmt: skip
 def test_ekf2_model_stops_fusion_and_resets_after_ekf2_timeouts(case, expected):
-    assert deciding(**case) == expected
+    assert decide_gnss_fusion(**case) == expected
 
 
 @pytest.mark.parametrize(("settings", "by_delay", "timing"), [
@@ -184,12 +184,14 @@ GNSS_RULES = replace(
     (7.1, 7.1, True, True), (6.9, 7.1, True, False), (7.1, 6.9, True, False),
     (13.9, 0.0, True, False), (14.1, 0.0, True, True), (7.1, 0.0, False, True),
 ])  # fmt: skip
-def test_ekf2_without_fusion_resets_to_gnss_after_7_or_14_s(
+def test_ekf2_resets_to_gnss_after_7_s_without_any_gnss_fusion(
     gap_s, velocity_gap_s, resets_velocity, resets
 ):
     """shouldResetGpsFusion: from PX4 main of 2026 on, a position reset ignores the velocity."""
     rules = replace(GNSS_RULES, resets_velocity=resets_velocity)
-    _, taken, reset, *_ = deciding(gap_s=gap_s, velocity_gap_s=velocity_gap_s, rules=rules, left=9)
+    _, taken, reset, *_ = decide_gnss_fusion(
+        gap_s=gap_s, velocity_gap_s=velocity_gap_s, rules=rules, left=9
+    )
     assert (taken, reset) == (False, resets)
 
 
@@ -245,7 +247,7 @@ def test_ekf2_replay_rejects_gnss_velocity_outside_gate(speed_m_s, moves):
     assert abs(wider.state[11, 0, 3]) > 1e-3
 
 
-def test_initial_correlations_at_rest_equal_kalman_filter_result():
+def test_initial_state_correlations_equal_15_state_kalman_filter():
     """Reference: a plain Kalman filter of a vehicle at rest for one minute, facing east."""
     turn = Rotation.from_euler("z", 110.0, degrees=True).as_matrix()
     count = 6000
@@ -388,7 +390,7 @@ def test_new_vision_reset_counter_resets_ekf2_position():
     np.testing.assert_allclose(done.state[6:, 0, 6], 0.3, atol=1e-6)
 
 
-def test_ekf2_replay_of_vehicle_at_rest_matches_kalman_filter():
+def test_ekf2_replay_variance_at_rest_equals_kalman_update():
     done = at_rest([0.0] * 20)
     np.testing.assert_allclose(done.state, 0.0, atol=1e-9)
     assert done.fused.all()
@@ -449,7 +451,7 @@ def test_closed_form_process_noise_equals_sum_over_steps(n):
         assert np.max(np.abs(found[0] - true) / scale) < (1e-9 if n == 4 else 0.03)
 
 
-def stretch_of(count: int, *, fusing: bool = True) -> ReplaySegment:
+def make_replay_segment(count: int, *, fusing: bool = True) -> ReplaySegment:
     return made(
         ReplaySegment, time_s=10.0 + 0.01 * np.arange(count + 1), starts_while_fusing=fusing
     )
@@ -460,8 +462,10 @@ def vision_of(stamps: list[float], age_s: float = 0.0) -> ReceivedPositions:
     return made(ReceivedPositions, timestamp_s=stamp, arrival_s=stamp + age_s)
 
 
-def acting(stamps: list[float], *, fusing: bool = True, rules: FusionRules = RULES) -> list[int]:
-    segment = stretch_of(500, fusing=fusing)
+def find_actions(
+    stamps: list[float], *, fusing: bool = True, rules: FusionRules = RULES
+) -> list[int]:
+    segment = make_replay_segment(500, fusing=fusing)
     taken = np.array(stamps)
     end = np.searchsorted(segment.time_s, taken - 1e-9)
     inputs = made(ReplayInputs, rules=rules)
@@ -469,15 +473,19 @@ def acting(stamps: list[float], *, fusing: bool = True, rules: FusionRules = RUL
     return action.tolist()
 
 
-def test_vision_fusion_start_and_stop_depend_on_sample_interval():
-    assert acting([10.1, 10.3, 10.45], fusing=False) == [NO_ACTION, NO_ACTION, START_FUSION]
-    assert acting([10.1, 10.29, 10.45], fusing=False) == [NO_ACTION, START_FUSION, FUSE]
-    assert acting([10.1, 10.29, 10.45]) == [FUSE, FUSE, FUSE]
+def test_ekf2_stops_vision_fusion_at_too_long_sample_interval():
+    assert find_actions([10.1, 10.3, 10.45], fusing=False) == [NO_ACTION, NO_ACTION, START_FUSION]
+    assert find_actions([10.1, 10.29, 10.45], fusing=False) == [NO_ACTION, START_FUSION, FUSE]
+    assert find_actions([10.1, 10.29, 10.45]) == [FUSE, FUSE, FUSE]
     # 0.4 s to the previous step
-    assert acting([10.1, 10.5, 10.6]) == [FUSE, FUSE, FUSE]
-    assert acting([10.1, 10.53, 10.6]) == [FUSE, NO_ACTION, START_FUSION]
+    assert find_actions([10.1, 10.5, 10.6]) == [FUSE, FUSE, FUSE]
+    assert find_actions([10.1, 10.53, 10.6]) == [FUSE, NO_ACTION, START_FUSION]
     old = replace(RULES, max_sample_interval_to_start_s=math.inf, stop_timeout_s=7.0)
-    assert acting([10.1, 12.0, 14.9], fusing=False, rules=old) == [NO_ACTION, START_FUSION, FUSE]
+    assert find_actions([10.1, 12.0, 14.9], fusing=False, rules=old) == [
+        NO_ACTION,
+        START_FUSION,
+        FUSE,
+    ]
 
 
 def events(
@@ -490,10 +498,10 @@ def events(
         rules=RULES,
         max_height_fusion_interval_in_position_gap_s=0.25,
     )
-    return _make_fusion_events(inputs, stretch_of(100), FusionDelays(delay_s, horizon_s))
+    return _make_fusion_events(inputs, make_replay_segment(100), FusionDelays(delay_s, horizon_s))
 
 
-def test_ekf2_replay_fuses_each_sample_at_end_of_an_interval():
+def test_ekf2_replay_fuses_vision_half_a_step_before_timestamp():
     """Half a step and the delay before its timestamp; additional events in gaps of vision."""
     found = events([10.2, 10.305, 10.9])
     has_sample = found.sample >= 0

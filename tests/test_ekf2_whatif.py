@@ -83,7 +83,7 @@ def test_what_if_is_unavailable_if_replay_differs_from_log(model):
         assert "no reason" in result.reason
 
 
-def test_contributions_to_kf_ekf2_difference_add_up_to_total(model):
+def test_parts_of_kf_ekf2_position_difference_add_up_to_total(model):
     for axis in explained(model).values():
         assert axis.longest_rejection is None
         assert tuple(step.name for step in axis.steps) == REPLACED_PROPERTIES
@@ -117,7 +117,7 @@ def test_kf_ekf2_difference_without_common_time_is_unavailable(model):
 # ----------------------------------------------------------- cases with a known answer
 
 
-def test_steps_from_kf_to_ekf2_replace_one_property_each():
+def test_each_step_from_kf_to_ekf2_replaces_one_filter_property():
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
     received = made(ReceivedPositions)
     plain = (made(ReplaySegment, flow=None, height_samples=None),)
@@ -208,7 +208,7 @@ def test_rmse_against_ground_truth_uses_only_common_times():
     assert compute_rmse_to_truth(made(Flight, truth=NONE), there, direction, times) is None
 
 
-def test_longest_time_without_fusion_includes_start_and_end():
+def test_longest_fusion_gap_includes_ends_of_evaluated_segment():
     evaluated_spans = ((15.0, 30.0), (40.0, 60.0))
     assert _find_longest_gap_s(np.array([16.0, 29.0, 41.0, 59.0]), evaluated_spans) == 18.0
     assert _find_longest_gap_s(np.array([40.0]), evaluated_spans) == 25.0
@@ -228,7 +228,7 @@ def test_what_if_summary_has_horizontal_nis_and_rmse() -> None:
     assert why.unexplained_fraction == 0.25
 
 
-def test_delay_above_ekf2_delay_max_adds_a_note():
+def test_what_if_delay_above_ekf2_delay_max_adds_a_note():
     """EKF2 increases EKF2_DELAY_MAX to the delay at its start (VerifyParams, EKF2.cpp)."""
     for by_delay, arrival_s, expected in (
         (False, 0.0, "EKF2 increases EKF2_DELAY_MAX from 200 to 264 ms"),
@@ -329,7 +329,7 @@ def test_what_if_above_35_percent_rejections_is_not_predictable(model):
     assert none.is_predictable
 
 
-def test_what_if_sensitive_to_noise_is_marked_unpredictable(model, monkeypatch):
+def test_what_if_sensitive_to_position_noise_is_unpredictable(model, monkeypatch):
     """Vary NIS, rejections and RMSE just inside and just outside their limits."""
     north = AxisStatistics(1.0, (0.9, 1.1), 0.1, 0.1, 0.1)
     base = Ekf2Statistics(

@@ -93,7 +93,7 @@ def test_grade_of_very_late_report_is_not_below_zero(due, rule, lateness_s, off)
     assert ada.total == 0.0
 
 
-def test_grade_of_reports_without_time_has_no_deduction() -> None:
+def test_grade_without_submission_time_has_no_late_deduction() -> None:
     files = {
         "hoppergrace_7_9_a.pdf": graded_report("", 7.0),
         "hoppergrace_7_8_b.pdf": graded_report("", 9.0),
@@ -188,7 +188,7 @@ def test_grade_keeps_first_report_if_later_one_needs_review() -> None:
     assert ada.counted_report.submission == "a.pdf"
 
 
-def test_submission_named_like_a_platform_export_is_flagged() -> None:
+def test_student_file_name_in_learning_platform_form_is_flagged() -> None:
     name = blackboard("ada", "20-10-00-00", "ada_attempt_2026-11-18-10-00-00_r.pdf")
     (ada, _), _ = make_grades({name: graded_report("", 4.0)})
     assert ada.submission_time == "2026-11-20 10:00"

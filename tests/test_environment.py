@@ -84,7 +84,7 @@ def test_command_out_of_memory_prints_one_error_line(monkeypatch, capsys, tmp_pa
 
 
 @pytest.mark.parametrize("command", ["tune {log} --start 126", "sync {log} --end 3"])
-def test_tune_or_sync_without_estimate_writes_no_file(
+def test_tune_or_sync_on_too_short_segment_writes_no_file(
     monkeypatch, capsys, tmp_path, command
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -20,7 +20,7 @@ def test_report_terminal_and_json_show_equal_numbers(shared_logs: Path, name: st
     assert contradictions(outputs) == []
 
 
-def test_numbers_that_differ_only_by_rounding_count_as_equal() -> None:
+def test_rounded_number_does_not_contradict_exact_number() -> None:
     exact = Statement("offset", "results", -0.4038)
     assert not printed("offset", "sync", "−0.404").contradicts(exact)
     assert printed("offset", "sync", "−0.405").contradicts(exact)

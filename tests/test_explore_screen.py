@@ -210,7 +210,7 @@ def test_explore_page_ekf2_curves_equal_logged_values(
 # ------------------------------------------------------------------ the step
 
 
-def test_explore_page_ellipse_shows_covariance_of_each_step(
+def test_explore_page_ellipse_shows_kf_covariance_at_each_update(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     shown = ask(

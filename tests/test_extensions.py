@@ -242,7 +242,7 @@ def test_extension_guide_names_only_existing_files() -> None:
             assert name.split()[-1] in EXTENSIONS
 
 
-def test_each_kf_setting_is_in_options_ranges_and_results() -> None:
+def test_each_kf_setting_has_an_option_a_range_and_a_result() -> None:
     names = set(Settings.__dataclass_fields__)
     assert names <= set(ComparisonRequest.__struct_fields__)
     assert names <= set(ChosenSettings.__struct_fields__)
@@ -252,7 +252,9 @@ def test_each_kf_setting_is_in_options_ranges_and_results() -> None:
     }
 
 
-def test_setting_without_unit_prints_no_dangling_blank(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_setting_without_unit_is_printed_without_trailing_space(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(SETTING_RANGES, "dt_s", Range(1.0, 5.0, "", "GATE"))
     assert SETTING_RANGES["dt_s"].format_label() == "GATE"
     assert "GATE 3, acceleration input imu" in format_settings(Settings(dt_s=3.0))
@@ -266,7 +268,7 @@ def test_setting_without_unit_prints_no_dangling_blank(monkeypatch: pytest.Monke
     assert "Gate (1 to 5)." in CliRunner().invoke(fuse, ["--help"]).output
 
 
-def test_request_options_accept_plain_numbers_and_flags(
+def test_command_line_option_accepts_number_without_unit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     class Request(msgspec.Struct):

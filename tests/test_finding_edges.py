@@ -110,7 +110,7 @@ def test_fault_report_lists_times_of_occurrence(spans: Any, expected: str) -> No
     assert format_spans(spans) == expected
 
 
-def test_status_flag_has_first_logged_value_at_earlier_times() -> None:
+def test_status_flag_before_first_sample_has_first_logged_value() -> None:
     flag, whole = pd.Series([1.0, 0.0, 1.0], index=[20.0, 30.0, 80.0]), Segment(10.0, 110.0, "")
     assert compute_flag_fraction(flag, whole) == 0.5
     assert compute_flag_fraction(flag, Segment(25.0, 35.0, "")) == 0.5
@@ -254,7 +254,9 @@ UNKNOWN = "The log does not show why EKF2 fused no position"
         ),
     ],
 )
-def test_finding_on_missing_ekf2_fusion_has_reason(flight: Any, reason: str, remedy: str) -> None:
+def test_report_on_ekf2_that_never_fuses_states_the_reason(
+    flight: Any, reason: str, remedy: str
+) -> None:
     finding = only(ekf2_fusion.detect_position_fusion_faults, flight)
     assert finding.severity == "error"
     assert finding.title.startswith("EKF2 never fused the UWB positions")
@@ -297,7 +299,7 @@ def test_severity_of_rejections_depends_on_rejected_percentage(
             assert finding.remedy.endswith(remedy)
 
 
-def test_rejection_action_sets_noise_if_rerun_halves_rejections() -> None:
+def test_ekf2_noise_is_advised_if_rerun_halves_rejections() -> None:
     frame = rejected(20, 100)
     for after, improves, action in (
         (0.09, True, "Set EKF2_EVP_NOISE to 0.1 m."), (0.1, True, CHECK_FIRST),
@@ -322,7 +324,7 @@ CHECK_FIRST = (
 # ---------------------------------------------------------------- errors and truth
 
 
-def test_report_on_error_above_reported_sigma_prefers_main_axis() -> None:
+def test_error_above_reported_sigma_is_reported_on_main_axis() -> None:
     ekf2 = axis("east", ekf2=statement(0.49), ekf2_truth=against_truth(25.0, 1.0))
     finding = only(hidden_errors.detect, analysis(axes=(axis(), hiding(name="down"), ekf2)))
     assert finding.title == (
@@ -426,7 +428,7 @@ def test_imu_rate_below_98_percent_of_required_is_reported(imu_hz, attitude_hz, 
         assert all(action.format(hz) in f.remedy for f, hz in zip(found, expected, strict=True))
 
 
-def test_finding_states_why_received_positions_are_not_logged() -> None:
+def test_report_states_why_positions_sent_to_ekf2_are_not_logged() -> None:
     lacks = (
         Unavailable("another", "no", "Do."),
         Unavailable("it", "it was disabled", "Do.", source="vehicle_visual_odometry"),
@@ -486,7 +488,7 @@ def test_wrong_frame_of_position_file_is_reported_as_error() -> None:
 
 
 @pytest.mark.parametrize(("until_s", "expected"), [(60.0, "warning"), (60.1, "note")])
-def test_frd_frame_finding_is_a_note_if_ekf2_fuses_source_yaw(
+def test_frd_frame_is_information_only_if_ekf2_fuses_vision_yaw(
     until_s: float, expected: str
 ) -> None:
     frd = source(frame="FRD")
@@ -535,7 +537,7 @@ def test_heading_drift_report_contains_heading_at_start_and_end() -> None:
 
 @pytest.mark.parametrize("noise_is_wrong", [False, True])
 @pytest.mark.parametrize("degrees", [(20.0,), (2.0, 30.0)])
-def test_heading_error_action_depends_on_rerun_with_gnss_noise(degrees, noise_is_wrong) -> None:
+def test_heading_error_advice_is_gnss_noise_if_rerun_confirms_it(degrees, noise_is_wrong) -> None:
     """A re-run with another EKF2_GPS_P_NOISE makes EKF2's innovations consistent."""
     trial = tried("ekf2", {"EKF2_GPS_P_NOISE": 0.4})
     one = analysis(
@@ -643,7 +645,7 @@ def clock_map(method: str = "TIMESYNC", distinct: int | None = None, jitter_s: f
     return ClockConversion("UNIX time", method, 600, 0.0, 0.0, jitter_s, "", distinct)
 
 
-def at_multiples(multiples: list[int], base_s: float = 0.125, **parts: Any) -> Any:
+def at_intervals(multiples: list[int], base_s: float = 0.125, **parts: Any) -> Any:
     time = 10.0 + np.concatenate([[0.0], base_s * np.cumsum(multiples)])
     return analysis(source=source(samples=positions(time), **parts))
 
@@ -689,7 +691,7 @@ def scaled(value: float, sigma: float = 0.01, imu_hz: float = 49.1, **parts: Any
     return analysis(**{**usual, **parts})
 
 
-def stating(reported: float, noise: float, interval: Any = None, **parts: Any) -> Any:
+def with_reported_sigma(reported: float, noise: float, interval: Any = None, **parts: Any) -> Any:
     """Make a source that reports one standard deviation (m) and has another one."""
     low, high = interval or (0.99 * noise, 1.01 * noise)
     states = source(samples=positions(np.arange(0.0, 120.0), variance_m2=reported**2))
@@ -741,18 +743,18 @@ SOURCE_EDGES = [
         (ages(20, 20, 0.1), "error"), (ages(20, 20, 0.0999), "warning"),
         (ages(0, 30, 0.00099), "warning"), (ages(0, 30, 0.001), None))),
     (ARRIVALS, analysis(ekf2=ages(20, 20), **REBUILT), None),
-    *((DOWNSAMPLED, at_multiples(multiples), expected) for multiples, expected in (
+    *((DOWNSAMPLED, at_intervals(multiples), expected) for multiples, expected in (
         ([1, 1, 2] * 20, "warning"), ([1, 1, 2] * 19 + [1, 1, 1], None),  # 25 % missing
         ([1, 2] * 25, "warning"), ([1, 2] * 24 + [1], None),  # at least 50 intervals
         ([2, 3] * 30, "error"),  # intervals of 0.31 s: EKF2 does not start
         ([2] * 54 + [3] * 6, "error"), ([2] * 55 + [3] * 5, None),  # at least 10 % of each multiple
         ([1] * 50 + [2] * 35 + [4] * 15, "error"), ([1] * 50 + [2] * 34 + [4] * 16, None))),
     # mapped timestamps and topics rebuilt by EKF2 show nothing
-    (DOWNSAMPLED, at_multiples([1, 2] * 30, clock_map=clock_map()), None),
-    (DOWNSAMPLED, at_multiples([1, 2] * 30, origin=ALIGNED_BY_EKF2_ORIGIN), None),
-    (DOWNSAMPLED, at_multiples([1, 2] * 30, origin=MOTION_CAPTURE_ORIGIN), "warning"),
+    (DOWNSAMPLED, at_intervals([1, 2] * 30, clock_map=clock_map()), None),
+    (DOWNSAMPLED, at_intervals([1, 2] * 30, origin=ALIGNED_BY_EKF2_ORIGIN), None),
+    (DOWNSAMPLED, at_intervals([1, 2] * 30, origin=MOTION_CAPTURE_ORIGIN), "warning"),
     # two samples lost in one interval
-    *((source_intervals.detect_lost_samples, at_multiples([1] * singles + [3], 0.25, **parts),
+    *((source_intervals.detect_lost_samples, at_intervals([1] * singles + [3], 0.25, **parts),
        expected)
       for singles, parts, expected in (
           (96, {"clock_map": clock_map()}, "note"), (97, {"clock_map": clock_map()}, None),
@@ -815,18 +817,18 @@ SOURCE_EDGES = [
       for outliers, count, expected in (
           (3, 600, "warning"), (3, 601, None), (3, 150, "error"), (3, 151, "warning"),
           (2, 100, None))),
-    *((STATED, stating(reported, noise), expected) for reported, noise, expected in (
+    *((STATED, with_reported_sigma(reported, noise), expected) for reported, noise, expected in (
         (3.0, 2.0, "warning"), (2.0, 3.0, "warning"), (1.41, 1.0, None), (1.42, 1.0, "warning"),
         (1.0, 1.41, None), (1.0, 1.42, "warning"), (1.73, 1.0, "warning"), (1.74, 1.0, "error"),
         (1.0, 1.74, "error"))),
     # inside the interval, no interval, unknown low pass, no reported variance, odometry
-    *((STATED, stating(3.0, 1.0, interval), None) for interval in (
+    *((STATED, with_reported_sigma(3.0, 1.0, interval), None) for interval in (
         (0.1, 9.0), (None, 9.0), (0.1, None))),
-    (STATED, stating(3.0, 1.0, tuning=tuned(NoiseEstimate(None, None, 9.0))), None),
-    (STATED, stating(3.0, 1.0, tuning={}), None),
-    (STATED, stating(3.0, 1.0, source_low_pass=NONE), None),
-    (STATED, stating(np.nan, 1.0), None),
-    (source_positions.detect, stating(3.0, 1.0, **ODOMETRY), None),
+    (STATED, with_reported_sigma(3.0, 1.0, tuning=tuned(NoiseEstimate(None, None, 9.0))), None),
+    (STATED, with_reported_sigma(3.0, 1.0, tuning={}), None),
+    (STATED, with_reported_sigma(3.0, 1.0, source_low_pass=NONE), None),
+    (STATED, with_reported_sigma(np.nan, 1.0), None),
+    (source_positions.detect, with_reported_sigma(3.0, 1.0, **ODOMETRY), None),
     *((CLOCK, analysis(time_offset=late(sign * offset_s, sigma_s)), expected)
       for sign in (1.0, -1.0)
       for offset_s, sigma_s, expected in (
@@ -869,7 +871,7 @@ def test_constant_jittery_or_unsynced_timestamps_are_reported(
     assert list(named(source_stamps.detect, analysis(source=source(clock_map=clock)))) == expected
 
 
-def test_arrival_times_used_until_clock_sync_are_reported() -> None:
+def test_arrival_times_as_timestamps_until_timesync_are_reported() -> None:
     one = analysis(ekf2=ages(12, 20, 0.05))
     finding = only(source_stamps.detect_arrival_timestamps, one)
     assert finding.evidence == {"until_s": 32.0, "latency_s": 0.05}
@@ -920,7 +922,7 @@ def test_position_sample_interval_is_found_despite_jitter() -> None:
 
 def test_gap_above_5_intervals_is_not_counted_as_lost_samples() -> None:
     for longest, lost in ((5.0, [4]), (5.1, [])):  # intervals of 0.25 s
-        one = at_multiples([1.0] * 20 + [longest], 0.25, clock_map=clock_map())  # type: ignore[list-item]
+        one = at_intervals([1.0] * 20 + [longest], 0.25, clock_map=clock_map())  # type: ignore[list-item]
         assert [each.evidence["lost"] for each in source_intervals.detect_lost_samples(one)] == lost
 
 
@@ -931,29 +933,29 @@ def test_position_jump_report_contains_count_and_largest_jump() -> None:
     assert finding.spans_s == ((30.0, 30.0), (60.0, 60.0))
 
 
-def test_scale_and_variance_findings_state_sign_of_error() -> None:
+def test_scale_error_report_states_if_distances_are_too_long() -> None:
     for signed, word in ((0.2, "long"), (-0.2, "short")):
         finding = only(source_positions.detect_scale_error, scaled(signed))
         assert finding.title == f"UWB distances are 20 % too {word}"
         assert "(± 2 %, 95 %)" in finding.message
     for reported, word in ((2.0, "large"), (0.5, "small")):
-        finding = only(source_positions.detect_wrong_variance, stating(reported, 1.0))
+        finding = only(source_positions.detect_wrong_variance, with_reported_sigma(reported, 1.0))
         assert finding.title == f"The variance that UWB reports is 4 times too {word}"
         assert ("time-correlated errors" in finding.message) is (word == "large")
 
 
 @pytest.mark.parametrize(("error_m", "expected"), [(1.41, "error"), (1.42, None)])
-def test_position_variance_that_covers_true_error_is_accepted(error_m, expected):
+def test_position_variance_below_true_error_is_not_too_large(error_m, expected):
     time = np.arange(0.0, 120.0)
     axes = tuple(axis(name) for name in ("north", "east"))
     for each, direction in zip(axes, np.eye(3), strict=False):
         each.axis.measurement_time_s, each.axis.measurement_m = time, error_m * (-1.0) ** time
         each.axis.direction = direction
     flight = {"truth": Truth("still", positions(time))}
-    subject = stating(2.0, 1.0, axes=axes, flight=flight)
+    subject = with_reported_sigma(2.0, 1.0, axes=axes, flight=flight)
     assert severity(source_positions.detect_wrong_variance, subject) == expected
     # a variance that is too small is reported in both cases
-    subject = stating(0.5, 1.0, axes=axes, flight=flight)
+    subject = with_reported_sigma(0.5, 1.0, axes=axes, flight=flight)
     assert severity(source_positions.detect_wrong_variance, subject) == "error"
 
 
@@ -989,7 +991,7 @@ def test_position_outlier_size_is_distance_to_ground_truth() -> None:
         assert f"outliers to {reference}: {north_m:.2f} m" in finding.message
 
 
-def test_outlier_finding_counts_outliers_that_ekf2_rejected() -> None:
+def test_outlier_report_counts_outliers_that_ekf2_rejected() -> None:
     innovations = pd.DataFrame({"rejected": np.zeros(120)}, index=np.arange(0.05, 120.0))
     innovations.iloc[[20, 40, 50], 0] = 1.0
     outliers = tuned(outlier_time_s=np.array([20.0, 30.0, 40.0]), count=120)
@@ -1005,7 +1007,7 @@ def test_outlier_finding_counts_outliers_that_ekf2_rejected() -> None:
 APPLIED = Settings(sigma_a_m_s2=1.0, sigma_z_m=1.0, clock_offset_s=-0.05)
 
 
-def test_time_offset_action_includes_the_offset_already_applied() -> None:
+def test_recommended_time_offset_includes_the_applied_offset() -> None:
     one = analysis(time_offset=late(-0.1, applied_s=-0.05), settings=APPLIED)
     finding = only(source_clock.detect, one)
     assert finding.title == "Position timestamps are 0.10 s late"
@@ -1137,6 +1139,6 @@ def test_timestamps_in_bursts_are_reported_as_jitter(size: int, is_reported: boo
     assert not is_reported or "bursts of 5, every 0.25 s" in found[0].message
 
 
-def test_repeated_positions_of_odometry_are_reported() -> None:
+def test_positions_that_odometry_sends_twice_are_reported() -> None:
     one = repeating(50, 100, orientation=object())
     assert named(source_errors.detect_noise_faults, one) == {"source_samples_repeated": "error"}

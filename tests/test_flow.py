@@ -67,7 +67,7 @@ def flying(noise_m_s: float = 0.3) -> Ekf2Model:
     return replace(model(), inputs=replace(inputs, segments=segments))
 
 
-def test_mean_flow_per_update_is_recovered_from_filtered_flow(tmp_path):
+def test_mean_optical_flow_is_recovered_from_low_pass_in_log(tmp_path):
     log = gnss_log("v1.16")
     log["estimator_states"]["states"][:, :4] = [1.0, 0.0, 0.0, 0.0]
     at = stamps(20.0, 50.0)
@@ -106,7 +106,7 @@ def test_mean_flow_per_update_is_recovered_from_filtered_flow(tmp_path):
 
 
 @pytest.mark.parametrize("every", [1, 10])
-def test_flow_velocity_averaged_for_update_equals_true_velocity(every):
+def test_mean_flow_velocity_of_each_update_equals_true_velocity(every):
     """The motion since a sample is known from the IMU, so corners cause no innovations."""
     (segment,) = model().inputs.segments
     with_flow = add_flow_samples(segment, flow_of(every=every), 3.0)
@@ -205,7 +205,7 @@ def test_read_gnss_omits_fixes_while_fusion_is_disabled():
     np.testing.assert_array_equal(found.timestamp_s, every.timestamp_s[remaining])  # type: ignore[union-attr]
 
 
-def test_ekf2_replay_start_covariance_uses_data_before_start():
+def test_ekf2_replay_initial_correlation_uses_preceding_imu_data():
     """Six seconds at rest and the climb correlate tilt and accelerometer bias."""
     (segment,) = model().inputs.segments
     assert segment.preceding_segment is not None
@@ -259,7 +259,7 @@ def test_ekf2_replay_restarts_if_optical_flow_drift_is_too_large(shared_logs, mo
 
 
 @pytest.mark.reallogs
-def test_ekf2_model_of_crash_flight_agrees_until_tumbling(shared_logs):
+def test_ekf2_model_of_crash_flight_agrees_with_log_until_crash(shared_logs):
     """Vertical velocity was reset at 47 s; the IMU clipped strongly at 26 and 46 s."""
     found = opened(read_log(shared_logs / "real" / "PX4_flight-review-rs_ekf_failure.ulg"))
     ends = [(one.time_s[0], one.time_s[-1]) for one in found.inputs.segments]

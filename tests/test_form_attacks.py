@@ -232,6 +232,6 @@ HONEST_FORMS: dict[str, tuple[CorrectFormAnswers, Answers, float]] = {
 
 
 @pytest.mark.parametrize("name", HONEST_FORMS)
-def test_answer_form_without_guesses_earns_expected_points(name: str) -> None:
+def test_honest_answer_form_earns_at_least_its_minimum_points(name: str) -> None:
     truth, form, expected = HONEST_FORMS[name]
     assert 100.0 * compute_form_points(form, truth).fraction >= expected - 0.01

@@ -173,7 +173,7 @@ def test_parse_g2o_accepts_rank_deficient_information() -> None:
 
 
 @given(st.text(alphabet="VERTEXSDG_23:QUAFI 0159.-einf#\n\r", max_size=200))
-def test_parse_g2o_of_any_text_raises_only_trajectory_errors(text: str) -> None:
+def test_parse_g2o_of_random_text_raises_only_its_own_error(text: str) -> None:
     for whole in (text, PLANE + text, SPACE + text):
         with contextlib.suppress(TrajectoryError):
             parse_g2o(whole, "a.g2o")

@@ -131,13 +131,13 @@ def test_gnss_fixes_have_position_and_time_that_ekf2_uses(generation, tmp_path):
     ({"EKF2_GPS_MODE": 0}, 0.03, 0.11 - 0.03),  # main of 2026: measurement time of the driver
     ({"EKF2_GPS_MODE": 0}, 0.0, 0.0),  # without one: the delay
 ])  # fmt: skip
-def test_gnss_time_is_driver_time_or_timestamp_minus_delay(parameters, own_s, expected_s, tmp_path):
+def test_gnss_time_is_driver_time_from_px4_main_of_2026_on(parameters, own_s, expected_s, tmp_path):
     track = track_of(flight_of(outdoors(own_s=own_s, **parameters), tmp_path))
     first = seconds_of(stamps(SECONDS, 5.0, 0.2))[0]
     assert track.samples.index[0] - first == pytest.approx(expected_s, abs=1e-6)
 
 
-def test_vehicle_gnss_track_equals_vehicle_gps_position_track(tmp_path):
+def test_vehicle_gnss_topic_gives_track_of_vehicle_gps_position(tmp_path):
     """vehicle_gnss contains the receiver's message; its timestamp_sample includes the delay."""
     log = with_velocity(outdoors(own_s=0.03, EKF2_GPS_MODE=0))
     before = track_of(flight_of(log, tmp_path))
@@ -179,7 +179,7 @@ def test_compare_subtracts_gnss_antenna_lever_arm(tmp_path):
     assert compare(flight_of(outdoors(), tmp_path)).source.notes == ()
 
 
-def test_default_source_is_gnss_only_if_ekf2_fused_it(tmp_path):
+def test_default_position_source_is_gnss_only_if_ekf2_fused_it(tmp_path):
     flight = flight_of(outdoors(), tmp_path)
     track, reason = choose_source(flight)
     assert track.name == "vehicle_gps_position"
@@ -198,7 +198,9 @@ def test_default_source_is_gnss_only_if_ekf2_fused_it(tmp_path):
     (0.4, 0.2, ("down",), 0.7),  # epv
     (0.4, 0.5, ("down",), 0.75),  # 1.5 times EKF2_GPS_P_NOISE
 ])  # fmt: skip
-def test_default_sigma_z_of_gnss_equals_ekf2_noise(eph_m, least_m, axes, expected_m, tmp_path):
+def test_default_kf_measurement_noise_equals_ekf2_gnss_noise(
+    eph_m, least_m, axes, expected_m, tmp_path
+):
     flight = flight_of(outdoors(eph_m=eph_m, EKF2_GPS_P_NOISE=least_m), tmp_path)
     request = ComparisonRequest(log="a.ulg", axes=axes)
     prepared = prepare_comparison(flight, request)
@@ -243,7 +245,7 @@ def with_barometer(log: Log, *, fused: bool = True) -> Log:
     return log
 
 
-def test_down_axis_of_gnss_flight_uses_fused_barometer(tmp_path):
+def test_height_measurement_of_gnss_flight_is_fused_barometer(tmp_path):
     flight = flight_of(with_barometer(outdoors()), tmp_path)
     request = ComparisonRequest(log="a.ulg", axes=("down", "north"))
     prepared = prepare_comparison(flight, request)
@@ -261,7 +263,7 @@ def test_down_axis_of_gnss_flight_uses_fused_barometer(tmp_path):
     assert isinstance(is_fused_as_gnss.flight.ekf2.innovations["down"], Unavailable)  # type: ignore[union-attr]
 
 
-def test_down_axis_uses_unfused_barometer_only_on_request(tmp_path):
+def test_height_measurement_is_unfused_barometer_only_on_request(tmp_path):
     flight = flight_of(with_barometer(outdoors(), fused=False), tmp_path)
     assert prepare(flight, axes=("down",)).source.barometer is None
     requested = prepare(flight, axes=("down",), height="barometer")
@@ -275,7 +277,7 @@ def test_down_axis_uses_unfused_barometer_only_on_request(tmp_path):
 
 
 @pytest.mark.reallogs
-def test_down_axis_of_px4_v1_13_log_uses_barometer(shared_logs):
+def test_height_measurement_of_px4_v1_13_log_is_barometer(shared_logs):
     """EKF2 of v1.13 uses the barometer height by default."""
     log = shared_logs / "gps" / "v1.13.3_gps_profile1.ulg"
     analysis = px4fuse.compare(log, axes="down")
@@ -310,7 +312,7 @@ def test_ground_truth_of_gnss_flight_is_relative_to_ekf2_origin(fused, tmp_path)
 @pytest.mark.parametrize(("least_m", "eph_m", "expected"), [
     (2.0, 0.3, True), (0.5, 0.45, False), (0.5, 0.9, False), (None, 0.3, False),
 ])  # fmt: skip
-def test_gnss_noise_above_receiver_sigma_is_reported(
+def test_ekf2_gps_p_noise_above_receiver_sigma_is_reported(
     least_m, eph_m, expected, tmp_path, monkeypatch
 ):
     log = outdoors(eph_m=eph_m)
@@ -384,7 +386,7 @@ def test_compare_of_real_gnss_flights_equals_reference_numbers(name, shared_logs
     assert isinstance(analysis.ekf2_model, Unavailable) == bool(reason)
     assert not reason or re.search(reason, analysis.ekf2_model.reason)
     assert verdicts == {aid: analysis.aids[aid].verdict for aid in verdicts}
-    assert as_in_the_log(analysis.aids, truth) >= 2
+    assert compare_mean_nis(analysis.aids, truth) >= 2
     if name in REBUILT_FROM_INNOVATIONS_ORIGIN:
         track = track_of(analysis.flight)
         assert "2.0" in track.notes[0]
@@ -396,14 +398,14 @@ def test_compare_of_real_gnss_flights_equals_reference_numbers(name, shared_logs
 
 
 @pytest.mark.reallogs
-def test_smaller_gnss_noise_is_advised_if_ground_truth_agrees(shared_logs):
+def test_smaller_gnss_noise_is_advised_if_nees_is_consistent(shared_logs):
     analysis = px4fuse.compare(shared_logs / "simulated" / "v1.16.1_no_uwb.ulg")
     remedies = {one.id: one.remedy for one in find(analysis)}
     assert remedies["kf_underconfident"].startswith("Set SIGMA_Z to 0.1")
     assert "noise that the receiver reports (0.9 m)" in remedies["ekf2_underconfident"]
 
 
-def as_in_the_log(found: dict[str, AidResult], truth: dict[str, Any]) -> int:
+def compare_mean_nis(found: dict[str, AidResult], truth: dict[str, Any]) -> int:
     """Compare the mean NIS of aiding sources with independent values; return their number."""
     stated = {
         # the stated number excludes rejected samples otherwise
@@ -468,7 +470,7 @@ def test_ekf2_model_of_real_gnss_flights_agrees_with_log(models):
 
 
 @pytest.mark.reallogs
-def test_what_if_with_gnss_settings_equals_independent_replay(models):
+def test_what_if_rmse_of_gnss_settings_equals_reference_numbers(models):
     """The simulated delay and noise; expected numbers are from an independent replay."""
 
     def error_m(name: str, **settings: float) -> tuple[float, float, float]:
@@ -538,7 +540,7 @@ def test_what_if_without_aiding_source_predicts_position_error(models):
 
 
 @pytest.mark.reallogs
-def test_what_if_with_unused_parameter_raises_settings_error(models):
+def test_what_if_with_parameter_without_effect_is_rejected(models):
     with pytest.raises(SettingsError, match="the replay of this log fuses only gnss_pos"):
         what_if(models["nominal"], [{"EKF2_EVP_NOISE": 0.2}])
     own = replace(models["nominal"].inputs.received_positions, uses_sender_timestamps=True)
@@ -650,7 +652,9 @@ def test_gnss_driver_timestamp_replaces_delay_parameter(tmp_path):
 @pytest.mark.parametrize(("north_m", "parameters", "scale", "with_velocity"), [
     (0.0, {}, 1.0, True), (np.nan, {}, 2.0, True), (np.nan, {"EKF2_GPS_MODE": 0.0}, 2.0, False),
 ])  # fmt: skip
-def test_gnss_reset_rule_depends_on_px4_release(north_m, parameters, scale, with_velocity):
+def test_gnss_position_reset_ignores_velocity_since_px4_of_2026(
+    north_m, parameters, scale, with_velocity
+):
     delayed_state = pd.DataFrame({"north_m": [north_m]})
     record = made(
         FusionRecord,

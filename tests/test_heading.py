@@ -107,7 +107,7 @@ def test_drifting_heading_error_is_estimated_per_flight_part(by):
     assert first.heading_error_deg > last.heading_error_deg
 
 
-def test_heading_error_range_is_unchanged_by_position_scale():
+def test_heading_drift_estimate_ignores_position_scale_error():
     flight, _ = with_heading_drift(simulated(passes=6))
     scale = 1.3
     scaled = tuple(
@@ -149,9 +149,7 @@ def test_heading_misalignment_without_data_gives_reason():
         ("mengchaoheng_PX4_ulog_plottools_hist_6a8cf408_test3", False, -15.0, 15.0),
     ],
 )
-def test_heading_error_from_positions_equals_that_of_orientation(
-    shared_logs, log, drifts, low, high
-):
+def test_heading_error_is_equal_from_positions_and_orientation(shared_logs, log, drifts, low, high):
     """Their orientation gives the misalignment of EKF2's magnetometer heading; so do positions."""
     flight = read_log(shared_logs / "real" / f"{log}.ulg")
     found = estimate(flight, 0.001)

@@ -199,13 +199,13 @@ def outdoors(baro_noise_m: float = 0.4) -> Flight:
 
 
 @cache
-def opened_once() -> Ekf2Model:
+def open_outdoor_model() -> Ekf2Model:
     return opened(outdoors())
 
 
 @pytest.mark.slow
-def test_what_if_with_baro_noise_equals_flight_with_this_noise() -> None:
-    model = opened_once()
+def test_what_if_nis_of_baro_noise_equals_flight_with_this_noise() -> None:
+    model = open_outdoor_model()
     assert model.agreement.baro_hgt["down"].innovation_correlation > 0.999
     assert model.agreement.baro_hgt["down"].position_rms_difference_m < 0.02
     other = opened(outdoors(2.0))
@@ -226,7 +226,7 @@ def test_what_if_with_baro_noise_equals_flight_with_this_noise() -> None:
 
 
 def test_what_if_without_height_sensor_reports_drift() -> None:
-    found = what_if(opened_once(), [{}], {"baro_hgt": 40.0})
+    found = what_if(open_outdoor_model(), [{}], {"baro_hgt": 40.0})
     (lost,) = found.whatif
     assert lost.heights == {}
     assert lost.height_rmse_to_truth_m > 2.0 * found.replayed.height_rmse_to_truth_m
@@ -238,7 +238,7 @@ def test_what_if_gives_no_result_after_long_height_rejection() -> None:
     flight = outdoors()
     jump = flight.barometer.copy()
     jump.loc[40.0:50.0, "down_m"] += 3.0
-    model = opened_once()
+    model = open_outdoor_model()
     ekf2, other = model.flight.ekf2, replace(flight, barometer=jump)
     log = replace(ekf2.aids["baro_hgt"], samples=pd.DataFrame())  # only the logged barometer
     ekf2 = replace(ekf2, aids=ekf2.aids | {"baro_hgt": log})
@@ -249,7 +249,7 @@ def test_what_if_gives_no_result_after_long_height_rejection() -> None:
     assert found.whatif[0].heights["baro_hgt"].longest_without_fusion_s > 5.0
 
 
-def test_what_if_excludes_height_sensor_that_disagrees_with_log() -> None:
+def test_what_if_excludes_barometer_if_replay_differs_from_log() -> None:
     flight = outdoors()
     noise = np.random.default_rng(1).normal(0.0, 1.0, (len(flight.barometer), 1))
     model = opened(replace(flight, barometer=flight.barometer + noise))
@@ -274,9 +274,9 @@ def test_what_if_excludes_height_sensor_that_disagrees_with_log() -> None:
         what_if(model, [{}], {"baro_hgt": 40.0})
 
 
-def test_ekf2_replay_of_heights_without_data_gives_reason() -> None:
+def test_ekf2_replay_without_all_height_samples_gives_reason() -> None:
     flight = outdoors()
-    model = opened_once()
+    model = open_outdoor_model()
     ekf2, segments = model.flight.ekf2, model.inputs.segments
     record = ekf2.record
 
@@ -308,7 +308,7 @@ def test_ekf2_replay_of_heights_without_data_gives_reason() -> None:
 
 def test_ekf2_model_sets_clipped_acceleration_noise_to_4_9_m_s2() -> None:
     """The noise is BADACC_BIAS_PNOISE of covariance.cpp."""
-    inputs = opened_once().inputs
+    inputs = open_outdoor_model().inputs
     (segment,) = inputs.segments
     spoilt = replace(segment, clipped_fraction=np.ones(len(segment.time_s), bool))
 
@@ -325,9 +325,9 @@ def test_ekf2_model_sets_clipped_acceleration_noise_to_4_9_m_s2() -> None:
     np.testing.assert_allclose(ran(clipped).variance, expected, rtol=1e-9)
 
 
-def test_clipped_fraction_of_step_is_mean_of_clipped_imu_axes() -> None:
+def test_clipping_fraction_is_number_of_clipped_imu_axes_over_3() -> None:
     flight = outdoors()
-    (plain,) = opened_once().inputs.segments
+    (plain,) = open_outdoor_model().inputs.segments
     clipped = pd.Series(0, flight.imu.index)
     at = plain.time_s[[100, 200]] - 1e-4
     clipped.iloc[np.searchsorted(flight.imu.index, at)] = [0b101, 0b111]
@@ -339,7 +339,7 @@ def test_clipped_fraction_of_step_is_mean_of_clipped_imu_axes() -> None:
     assert np.flatnonzero(update_records.clipped_fraction).tolist() == [100, 200]
 
 
-def test_bad_acceleration_flag_is_set_by_two_large_innovations() -> None:
+def test_two_large_height_innovations_set_bad_acceleration_flag() -> None:
     """Two innovations of different sensors, above 3 √S and above √S; the flag lasts 3 s."""
     nan = np.nan
     segment = climbing(of_baro([10], [0.0]))

@@ -75,7 +75,7 @@ def found(analysis: Analysis, detectors: tuple[Any, ...] = DETECTORS) -> dict[st
 # ------------------------------------------------------------------ the regression
 
 
-def test_innovations_after_position_step_equal_kf_replay() -> None:
+def test_vectorised_kf_innovations_with_step_equal_kf_replay() -> None:
     """Compare innovations with and without a step with KF replays."""
     north = compare(aisle_flight(duration_s=30.0), RIGHT, axes=("north",))["north"].axis
     step = np.where(north.measurement_time_s >= 12.0, 0.7, 0.0)
@@ -209,7 +209,7 @@ def test_simulated_fault_is_reported_first_with_its_size(mistake, name, severity
         ("sigma_a_too_large", "", {"sigma_a_m_s2": 2.0}, "error", "no re-run confirmed"),
     ],
 )
-def test_report_on_simulated_fault_contains_its_action(
+def test_report_on_simulated_fault_contains_recommended_action(
     name, mistake, settings, severity, remedy
 ) -> None:
     named = found(analysed(flight(), replace(RIGHT, **settings)) if settings else flown(mistake))
@@ -244,7 +244,7 @@ def test_outlier_burst_is_not_reported_as_position_jump() -> None:
     assert heading == pytest.approx(30.0, abs=15.0)
 
 
-def test_size_of_jump_at_reset_does_not_depend_on_time_offset() -> None:
+def test_position_jump_size_at_source_reset_ignores_time_offset() -> None:
     comparison = compare(flight("jump=0.5,40s"), RIGHT, axes=("north", "east"))
     sizes_m = []
     for delay_s in (0.0, 0.3):
@@ -264,7 +264,7 @@ def test_size_of_jump_at_reset_does_not_depend_on_time_offset() -> None:
     assert sizes_m[1] == pytest.approx(sizes_m[0], abs=1e-6)
 
 
-def test_time_offset_is_not_reported_as_low_pass_filter() -> None:
+def test_late_positions_are_not_reported_as_low_pass_filtered() -> None:
     late = flown("clock-offset=250ms", passes=6)
     assert late.source_low_pass.gain_nats == 0.0
     _, low_pass, _ = _fit_source_errors(late, late.tuning, unavailable("clock offset"), None, {})
@@ -349,7 +349,7 @@ def without_variances(flight: Flight) -> Flight:
         ("r-scale=0.25", without_variances),
     ],
 )
-def test_bias_scale_and_jump_findings_require_imu_or_variance(mistake, change) -> None:
+def test_fault_without_its_imu_or_variance_data_is_not_reported(mistake, change) -> None:
     named = set(found(analysed(change(flight(mistake))), OF_CAUSES))
     assert named <= {"source_outliers"}
 

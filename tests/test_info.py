@@ -221,7 +221,7 @@ def test_info_does_not_use_position_source_as_ground_truth(tmp_path):
 # ---- gaps -------------------------------------------------------------------------------------
 
 
-def test_info_reports_count_and_duration_of_gaps(tmp_path):
+def test_info_reports_count_and_duration_of_sample_gaps(tmp_path):
     log = make_log(seconds=40.0)
     for name, rate_hz, first_s in (("sensor_combined", 100, 0.0),
                                    ("vehicle_visual_odometry", 5, 0.1)):  # fmt: skip

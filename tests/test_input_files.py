@@ -133,7 +133,7 @@ def test_batch_refuses_output_folder_that_contains_logs(tmp_path, monkeypatch) -
 # --- the register ---
 
 
-def test_write_to_protected_input_file_is_refused(tmp_path) -> None:
+def test_write_to_file_that_was_read_as_input_is_refused(tmp_path) -> None:
     from px4fuse.core.input_files import protect_inputs
     from px4fuse.core.reading import read_text
     from px4fuse.core.writing import write_output_files

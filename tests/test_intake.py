@@ -224,7 +224,7 @@ ACTS = {
 
 
 @pytest.mark.parametrize(("said", "edit"), ACTS.items(), ids=ACTS)
-def test_report_pdf_with_script_link_or_launch_is_rejected(edit, said):
+def test_report_pdf_with_active_content_is_rejected(edit, said):
     assert said in reason(small_report(edit=edit))
     assert "the PDF contains" in reason(small_report(edit=edit))
 
@@ -289,7 +289,7 @@ def test_read_report_pdf_compression_bomb_takes_little_memory(pdf, said):
     b"/Filter [" + b"/FlateDecode " * 20 + b"]", b"/Filter [/FlateDecode /FlateDecode]",
     b"/Filter /LZWDecode", b"/Filter /Invented", b"/Filter [/DCTDecode /DCTDecode]", b"/Filter 7",
 ])  # fmt: skip
-def test_read_report_pdf_with_other_compression_is_rejected(filters):
+def test_report_pdf_with_unsupported_compression_is_rejected(filters):
     attached = with_attachment(stream(zlib.compress(JSON), b"/Type /EmbeddedFile " + filters))
     assert "a stream with unsupported compression" in reason(attached)
     content = raw_pdf(CATALOG, PAGES, PAGE, stream(b"x", filters))
@@ -362,7 +362,7 @@ def test_read_report_removes_control_characters_from_texts():
 # ------------------------------------------------------------------ other types
 
 
-def test_read_report_pdf_with_wrong_types_raises_no_exception():
+def test_read_report_pdf_of_wrong_object_types_does_not_crash():
     """Values of unexpected types at each key that read_report uses."""
     odd = [NumberObject(7), TEXT, ArrayObject(), dictionary(), DecodedStreamObject()]
     for key in ("/Names", "/Pages", "/Outlines", "/Metadata", "/S", "/Filter", "/EF", "/Annots"):

@@ -40,7 +40,7 @@ FORM = Answers(
 )
 
 
-def test_rubric_item_points_are_correlated_with_other_points() -> None:
+def test_item_discrimination_is_correlation_with_other_items() -> None:
     for index, item in enumerate(analyse_items(REPORTS)):
         others = POINTS.sum(axis=1) - POINTS[:, index]
         expected = np.corrcoef(POINTS[:, index], others)[0, 1]

@@ -15,7 +15,7 @@ t 3.0 s: p 2.93 (true 3.00), v 0.92, sigma_p 0.081 m, sigma_v 0.136 m/s
 """
 
 
-def test_lesson_kalman_command_prints_output_of_example_1() -> None:
+def test_lesson_kalman_command_prints_output_shown_in_lesson() -> None:
     assert run("lesson", "kalman").output == EXAMPLE_1
 
 
@@ -30,5 +30,5 @@ loop closure error (1.2, 0.8) m over 80.4 m = 1.8%
 """
 
 
-def test_lesson_loop_command_prints_output_of_example_2() -> None:
+def test_lesson_loop_command_prints_output_shown_in_lesson() -> None:
     assert run("lesson", "loop").output == EXAMPLE_2

@@ -35,7 +35,7 @@ def walk(seed: int = 3, *, sigma_z: float = 0.1, count: int = 4000) -> Axis:
     return random_walk(rng, count=count, interval_s=0.2, sigma_a=0.5, sigma_z=sigma_z)
 
 
-def test_fast_kf_on_noise_grid_equals_kf_replay(sample_flight: Flight) -> None:
+def test_vectorised_kf_innovations_equal_kf_replay_at_any_noise(sample_flight: Flight) -> None:
     for axis in sample_axes(sample_flight):
         intervals = preintegrate(axis, Settings())
         for i, sigma_a in enumerate(SIGMA_A):

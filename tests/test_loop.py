@@ -246,7 +246,7 @@ def test_false_loop_closure_is_rejected_among_true_ones() -> None:
     assert "loop_closure_inconsistent" not in named
 
 
-def test_loop_closure_gate_p_value_at_true_landing_is_uniform() -> None:
+def test_p_value_of_correct_loop_closure_is_uniform() -> None:
     """The gate assumes the noise with which the laps are simulated."""
     p = []
     for seed in range(60):
@@ -278,7 +278,7 @@ def test_loop_that_does_not_return_to_start_is_not_corrected() -> None:
     assert find_loop_findings(opened) == ()
 
 
-def test_loop_closure_without_equal_heading_uses_position_only() -> None:
+def test_loop_closure_at_other_heading_uses_position_only() -> None:
     _, odometry = laps(1, 4, OdometryNoise())
     turned = close_loop(odometry)  # the vehicle lands with another heading
     assert isinstance(turned.heading_error_deg, Unavailable)
@@ -313,7 +313,7 @@ def test_loop_drift_option_below_true_drift_is_reported() -> None:
     assert "loop_drift_too_small" in {finding.id for finding in find_loop_findings(found)}
 
 
-def test_loop_without_ground_truth_reports_assumed_landing(
+def test_loop_without_ground_truth_assumes_landing_at_take_off(
     sample: LoopSource, sample_loop: Loop
 ) -> None:
     assert find_loop_findings(sample_loop) == ()  # the log contains ground truth
@@ -421,12 +421,12 @@ def test_loop_on_slam_file_rotates_camera_frame_to_z_down() -> None:
     ({"start_s": 96.0, "end_s": 98.0}, "is too short for key frames"),
     ({"key_frames_m": 101.0}, "`key_frames_m` 101 is out of range"),
 ])  # fmt: skip
-def test_loop_with_invalid_segment_or_closure_is_rejected(sample, how, says) -> None:
+def test_loop_analysis_with_invalid_times_is_rejected(sample, how, says) -> None:
     with pytest.raises((TrajectoryError, SettingsError), match=says):
         analyse_loop(sample, **how)
 
 
-def test_trajectory_argument_is_split_into_log_and_source(tmp_path: Path) -> None:
+def test_trajectory_argument_is_split_into_file_and_track_name(tmp_path: Path) -> None:
     assert split_path_and_part(f"{SAMPLE}:ekf2") == (SAMPLE, "ekf2")
     assert split_path_and_part(str(SAMPLE)) == (SAMPLE, None)
     odd = tmp_path / "a:vio"

@@ -300,7 +300,7 @@ def test_fitted_imu_biases_equal_dense_least_squares() -> None:
         np.testing.assert_array_equal(count, np.isfinite(part.measurement_m).sum(axis=1))
 
 
-def test_likelihood_is_unchanged_if_smooth_path_is_subtracted() -> None:
+def test_likelihood_is_equal_without_smooth_path_of_positions() -> None:
     part = with_constants()
     given = [arguments(each, SOME_NOISES[0], WEIGHT) for each in (part, subtract_smooth_path(part))]
     plain, found_values = (fit_positions(*each).compute_scores()[0] for each in given)
@@ -507,7 +507,7 @@ def test_sigma_of_noise_estimate_follows_likelihood_curvature(axes, share, width
     assert widening == pytest.approx(curved * 2.0 * axes * 4000, rel=0.01)
 
 
-def test_noise_fit_without_outliers_uses_measurement_weights() -> None:
+def test_noise_fit_without_outlier_model_keeps_given_weights() -> None:
     weight = np.random.default_rng(1).uniform(0.2, 1.0, MANY)
     parts = [convert_to_positions_and_increments(preintegrate(pair(1)[0], TRUE))]
     found = maximise_likelihood(parts, NoiseParameters(0.5, 0.1), weight, fits_outliers=False)

@@ -163,7 +163,7 @@ def test_mavlink_scaled_imu_is_converted_to_si_units(read, name):
     assert_allclose(imu[Columns.ANGULAR_RATE].iloc[0], [1.0, -0.02, 0.003], rtol=1e-12)
 
 
-def test_mavlink_raw_imu_is_unavailable_with_reason(read):
+def test_mavlink_raw_imu_without_unit_is_unavailable(read):
     recorder = add(record_without(Aisle(), "HIGHRES_IMU"), 50.0, lambda t: message(
         "RAW_IMU", time_usec=us(t), xacc=17, zacc=-998,
     ))  # fmt: skip
@@ -428,7 +428,7 @@ def test_mavlink_parameter_out_of_range_is_replaced_by_default(read):
 @pytest.mark.parametrize(
     "missing_messages", [(), ("VISION_POSITION_ESTIMATE",), ("HIGHRES_IMU", "ODOMETRY")]
 )
-def test_ardupilot_messages_contain_no_px4_advice(read, missing_messages):
+def test_advice_on_ardupilot_recording_names_no_px4_terms(read, missing_messages):
     """ArduPilot has no ULog, no PX4 console and no PX4 parameters."""
     recorder = record_without(
         Aisle(imu_hz=4.0, seconds=20.0), *missing_messages, "EXTENDED_SYS_STATE"

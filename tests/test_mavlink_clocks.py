@@ -307,7 +307,7 @@ def test_mavlink_autopilot_without_heartbeat_is_found(read, change, stamped):
         np.testing.assert_allclose(np.diff(flight.imu.index), 1.0 / aisle.imu_hz, atol=1e-5)
 
 
-def test_mavlink_stream_without_times_has_note_on_missing_time(read):
+def test_mavlink_stream_without_timestamps_adds_note(read):
     flight = read(Recorder().hear(0.0, AUTOPILOT, heartbeat()), stamped=False)
     assert flight.log.duration_s == 0.0
     assert any("no message in the stream contains a time" in note for note in flight.log.notes)
@@ -381,7 +381,7 @@ def test_mavlink_system_option_selects_one_of_several_vehicles(read):
             read(recorder, system=system)
 
 
-def test_mavlink_sender_report_has_fraction_of_lost_messages(tmp_path):
+def test_mavlink_sequence_gaps_give_lost_fraction_per_sender(tmp_path):
     """Every tenth message of the companion is missing, every twentieth is repeated."""
     aisle = Aisle(seconds=60.0)
     recorder = aisle.record()

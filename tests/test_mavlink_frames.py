@@ -182,7 +182,7 @@ def example(kind) -> object:
     return message(kind.msgname, **fields)
 
 
-def test_each_mavlink_message_type_is_decoded_to_packed_values(read):
+def test_each_mavlink_message_is_decoded_as_packed_by_pymavlink(read):
     """The layouts are from pymavlink's tables, the bytes from its packers."""
     kinds = [kind for _, kind in sorted(MESSAGES.items())]
     made = [example(kind) for kind in kinds]
@@ -287,7 +287,7 @@ def test_invalid_bytes_between_mavlink_frames_are_skipped(read, junk):
     assert frames.byte_count_outside_frames == len(junk)
 
 
-def test_tlog_receive_time_is_not_read_as_start_of_a_frame(read):
+def test_tlog_time_with_frame_start_byte_is_not_read_as_frame(read):
     """Its last bytes and the next frame together form a valid MAVLink 1 STATUSTEXT."""
     head = raw_frame(30, b"\x01\x02\x03", seed=0, sequence=3)[:-2]
     body = bytes([12, 1, 1, 1]) + bytes([0xFD, 28]) + head[2:]

@@ -84,7 +84,7 @@ def trial(
         (0.101, NoiseEstimate(0.033, 0.032, 0.034), ("warning", 3.06)),
     ],
 )  # fmt: skip
-def test_wrong_noise_severity_depends_on_ratio_to_estimate(
+def test_kf_noise_of_1_5_times_the_estimate_is_a_warning(
     chosen: float, estimate: NoiseEstimate, expected: Any
 ) -> None:
     off = noises.find_setting_deviation("sigma_z_m", chosen, estimate)
@@ -118,7 +118,9 @@ SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m":
           ("sigma_a_too_large", "note", noises.NO_IMPROVEMENT_ACTION)]),
     ],
 )  # fmt: skip
-def test_noise_setting_of_best_filter_rerun_is_recommended(trials: Any, expected: Any) -> None:
+def test_kf_noise_setting_that_improves_the_rerun_is_recommended(
+    trials: Any, expected: Any
+) -> None:
     fitted = tuned(NoiseEstimate(0.5, 0.45, 0.55), NoiseEstimate(0.1, 0.09, 0.11))
     cause, other = noises.detect_wrong_settings(
         analysis(source=MOVING, tuning=fitted, reruns=trials)
@@ -135,7 +137,7 @@ def test_noise_setting_of_best_filter_rerun_is_recommended(trials: Any, expected
         (0.5, None, ("note", noises.NO_IMPROVEMENT_ACTION)),
     ],
 )
-def test_noise_finding_severity_depends_on_rerun_improvement(
+def test_wrong_noise_is_information_only_if_rerun_is_no_better(
     nis_mean: float, rmse_m: float | None, expected: tuple[str, str]
 ) -> None:
     """A re-run shows no improvement if σ is consistent before and the position error unknown."""
@@ -148,7 +150,7 @@ def test_noise_finding_severity_depends_on_rerun_improvement(
     assert (finding.severity, finding.remedy) == expected
 
 
-def test_wrong_noise_report_contains_factor_and_estimated_noise() -> None:
+def test_wrong_kf_noise_report_states_ratio_to_estimate() -> None:
     fitted = tuned(NoiseEstimate(0.5, 0.45, 0.55), NoiseEstimate(0.1, 0.09, 0.11))
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=fitted))
     assert worse.evidence["factor"] == pytest.approx(10.0)
@@ -184,7 +186,7 @@ def test_tune_does_not_advise_smaller_noise_for_gnss(
     assert dict(list_tuning_advice(flight, fitted)).keys() == expected
 
 
-def test_untested_sigma_z_above_upper_bound_is_reported() -> None:
+def test_kf_sigma_z_above_upper_bound_of_estimate_is_reported() -> None:
     bounded = tuned(NoiseEstimate(None, None, 0.0021))
     finding = only(noises.detect_wrong_settings, analysis(source=MOVING, tuning=bounded))
     assert finding.remedy == UNTESTED_SIGMA_Z
@@ -206,7 +208,7 @@ def test_untested_sigma_z_above_upper_bound_is_reported() -> None:
          ["sigma_a_too_large", "sigma_z_too_small"]),
     ],
 )  # fmt: skip
-def test_too_large_noise_for_odometry_is_not_reported(
+def test_kf_noise_is_not_called_too_large_for_odometry(
     parts: dict[str, Any], expected: list[str]
 ) -> None:
     estimate = 3.0 * (parts.get("settings") or CHOSEN).sigma_z_m
@@ -244,7 +246,7 @@ def test_near_zero_q_with_white_innovations_is_not_reported(one: Any, expected: 
     assert severity(noises.detect_process_noise_near_zero, analysis(axes=(one,))) == expected
 
 
-def test_near_zero_sigma_a_finding_reports_kf_response_time() -> None:
+def test_near_zero_process_noise_report_states_kf_response_time() -> None:
     slower = following(0.01)
     slower.axis.name = "east"
     finding = only(noises.detect_process_noise_near_zero, analysis(axes=(following(0.05), slower)))
@@ -333,7 +335,7 @@ def fused(noise_m: float, nis: float = 5.0, name: str = "north", **parts: Any) -
     [({}, 0.1, True), ({"EKF2_EVP_NOISE": 0.1}, 0.1, True), ({"EKF2_EVP_NOISE": 0.11}, 0.1, False),
      ({}, 0.124, True), ({}, 0.126, False), ({}, 0.081, True), ({}, 0.079, False)],
 )  # fmt: skip
-def test_ekf2_noise_within_25_percent_of_default_is_default(flown, used_m, default):
+def test_used_ekf2_noise_within_25_percent_counts_as_px4_default(flown, used_m, default):
     assert (
         _has_default_noises(analysis(log=log(parameters=flown)), "ekf2", fused(used_m)) is default
     )
@@ -363,7 +365,7 @@ def test_ekf2_noise_within_25_percent_of_default_is_default(flown, used_m, defau
         ("ekf2", {"EKF2_ACC_NOISE": 0.35}, "process noise", "Set EKF2_ACC_NOISE to 0.35 m/s²."),
     ],
 )  # fmt: skip
-def test_action_for_inconsistent_filter_corrects_its_cause(owner, change, kind, action) -> None:
+def test_inconsistent_filter_advice_is_setting_found_by_rerun(owner, change, kind, action) -> None:
     # changes that explain less than 0.5 or more than 1.5 are not causes
     causes = (tried(owner, {"sigma_z_m": 7.0}, explained_fraction=0.4), tried(owner, change),
               tried(owner, {"sigma_z_m": 7.0}, explained_fraction=1.6))  # fmt: skip
@@ -373,7 +375,7 @@ def test_action_for_inconsistent_filter_corrects_its_cause(owner, change, kind, 
     assert finding.evidence["cause"] == kind
 
 
-def test_filter_rerun_without_improvement_is_not_recommended() -> None:
+def test_kf_noise_that_does_not_reduce_nis_is_not_recommended() -> None:
     change = {"sigma_z_m": 2.0}
     for after, action in (
         (1.0, "Set SIGMA_Z to 2 m (--sigma-z 2)."),
@@ -384,7 +386,7 @@ def test_filter_rerun_without_improvement_is_not_recommended() -> None:
         assert only(noises.detect_inconsistent_variances, one).remedy == action
 
 
-def test_inconsistency_without_known_cause_recommends_a_check() -> None:
+def test_unexplained_kf_inconsistency_advises_to_check_imu() -> None:
     causes = (tried("kf", {"sigma_z_m": 7.0}, explained_fraction=0.4),
               tried("kf", {"sigma_z_m": 2.0}, "east"))  # fmt: skip
     one = analysis(axes=(kf(9.0),), reruns=causes, tuning=tuned())
@@ -408,7 +410,7 @@ def test_ground_truth_decides_if_noise_of_gnss_may_be_reduced() -> None:
         assert finding.remedy.startswith("Set SIGMA_Z to 0.2 m" if is_reduced else "Do not reduce")
 
 
-def test_smaller_noise_that_contradicts_ground_truth_is_rejected() -> None:
+def test_smaller_kf_noise_that_increases_nees_is_not_advised() -> None:
     contradicted = tried("kf", {"sigma_z_m": 0.5}, before=0.2)
     contradicted = replace(contradicted, after=replace(contradicted.after, nees_mean=4.0))
     one = analysis(axes=(kf(0.2),), reruns=(contradicted,))
@@ -467,7 +469,7 @@ def test_overconfident_ekf2_without_replay_gets_noise_advice(
           "GNSS noise is 4 times the noise setting of EKF2: EKF2 rejects 44 % of the positions")),
     ],
 )  # fmt: skip
-def test_wrong_default_noise_finding_names_position_sensor(
+def test_report_on_wrong_default_noise_names_position_sensor(
     flown_m: float, kind: str, rejected: float, expected: tuple[str, str, str]
 ) -> None:
     aid = GNSS_POS if kind == "gnss" else EV_POS
@@ -545,7 +547,7 @@ def closing(gap_m: float | None, length_m: float = 50.0, end: Any = NONE, **part
     return loop(closure_error_m=gap_m, path_length_m=length_m, true_end=end, **usual | parts)
 
 
-def test_finding_that_source_may_drift_states_closure_error() -> None:
+def test_report_on_possible_odometry_drift_has_closure_error() -> None:
     finding = only(hidden_errors.detect, analysis(source=ODOMETRY))
     assert finding.evidence == {"source": "uwb"}
     assert finding.message.endswith("innovations do not show the drift.")
@@ -564,7 +566,7 @@ def test_finding_that_source_may_drift_states_closure_error() -> None:
 
 
 @pytest.mark.parametrize("heading_error_deg", [0.0, 90.0])
-def test_loop_command_is_advised_only_if_orientation_is_correct(heading_error_deg: float) -> None:
+def test_loop_is_advised_only_if_odometry_orientation_is_right(heading_error_deg: float) -> None:
     orientation = OrientationConvention(
         verdict="determined", heading_error_deg=heading_error_deg, tilt_difference_deg=0.1
     )
@@ -590,7 +592,7 @@ END = TrueFinalPose(displacement_m={"forward": 0.0, "right": 0.0, "down": 0.0}, 
         (NONE, None),
     ],
 )  # fmt: skip
-def test_source_drift_finding_states_closure_error_if_known(loop: Any, size: str | None) -> None:
+def test_odometry_drift_report_states_loop_closure_error(loop: Any, size: str | None) -> None:
     one = analysis(axes=(hiding(nees=25.0),), source=ODOMETRY, loop=loop)
     finding = only(hidden_errors.detect, one)
     assert (finding.id, finding.severity) == ("source_drift", "error")
@@ -624,7 +626,7 @@ def test_changed_setting_text_contains_old_and_new_value(
     assert cause_text.format_change(one, tried(owner, change)) == expected
 
 
-def test_advice_on_untested_noise_option_is_to_try_the_default() -> None:
+def test_sigma_z_option_without_rerun_is_advised_to_try_default() -> None:
     request = SimpleNamespace(sigma_z_m=0.3, sigma_a_m_s2=None)
     one = analysis(request=request, reruns=())
     default_text = "To test the default value, run again without --sigma-z."

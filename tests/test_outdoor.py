@@ -172,7 +172,7 @@ def test_simulated_outdoor_fault_is_reported_first(mistake: str, root: str) -> N
         ("r-scale=0.1", "nis", "EKF2_GPS_P_NOISE", 0.4, 0.02),
     ],
 )
-def test_correction_of_outdoor_fault_makes_ekf2_consistent(
+def test_ekf2_rerun_with_corrected_gnss_fault_is_consistent(
     mistake: str, of: Any, name: str, value: float, within: float
 ) -> None:
     analysis = flown(mistake)
@@ -207,7 +207,7 @@ def test_larger_ekf2_acc_noise_reduces_nees_under_vibration() -> None:
     assert np.nanmean(error_m**2) / variances < 1.5**2 < tried.after.nees_mean
 
 
-def test_what_if_with_true_gnss_delay_equals_faultless_flight() -> None:
+def test_what_if_rmse_at_true_gnss_delay_is_that_without_fault() -> None:
     wrong, right = (flown(*texts).ekf2_model for texts in (("ekf2-delay=0",), ()))
     result, other = what_if(wrong, [{"EKF2_GPS_DELAY": 110.0}]), what_if(right, [])
     (predicted,), true = result.whatif, other.logged
@@ -245,7 +245,7 @@ def test_time_offset_message_names_gnss_receiver_delay() -> None:
     assert int(estimate_ms) == pytest.approx(110 + 250, abs=60)
 
 
-def test_magnetometer_disturbance_is_cause_of_missing_fusion() -> None:
+def test_magnetometer_shift_is_reported_as_cause_of_lost_fusion() -> None:
     changed, starved = [item for item in find(flown("mag=0.2")) if item.id.startswith("aid_")]
     assert (changed.id, starved.id) == ("aid_innovation_shift", "aid_not_fused")
     assert starved.caused_by == "aid_innovation_shift"
@@ -275,7 +275,7 @@ def test_simulated_correlated_error_has_requested_sigma_and_tau() -> None:
     assert np.std(first) == pytest.approx(0.5, rel=0.1)
 
 
-def test_simulated_heading_error_grows_exponentially_to_its_size() -> None:
+def test_simulated_heading_error_reaches_set_angle_exponentially() -> None:
     time_s = np.array([0.0, 39.9, 43.0, 100.0])
     clean = sensors.simulate_attitude_error(OUTDOOR, FaultSizes(), time_s).as_rotvec()
     wrong = sensors.simulate_attitude_error(

@@ -158,7 +158,7 @@ def test_g2o_without_vertices_starts_from_chordal_solution(name: str) -> None:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_square_loop_closure_error_is_spread_by_distance(dimension: int) -> None:
+def test_pose_graph_spreads_closure_error_by_path_length(dimension: int) -> None:
     """With equal variance per metre and exact rotations the correction grows with distance."""
     free, side = TANGENT[dimension], 10
     step = np.zeros((4 * side, free))
@@ -436,7 +436,7 @@ def test_loop_closure_gate_without_odometry_edge_raises_error() -> None:
     assert gate_edges(graph, np.zeros(0, int)) == []
 
 
-def test_scaling_all_information_matrices_keeps_gate_results() -> None:
+def test_scaled_information_keeps_accepted_loop_closures() -> None:
     graph = odometry_graph(2, 3e-3)
     ends = np.arange(4, 34)
     truth, information = graph.poses, np.tile(graph.information[:1], (len(ends), 1, 1))

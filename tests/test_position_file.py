@@ -202,7 +202,7 @@ def test_read_position_file_keeps_microseconds_of_ns_timestamps(read):
 
 
 @pytest.mark.parametrize("rate", [0.2, 200])
-def test_read_position_file_with_0_2_or_200_hz_adds_no_note(read, rate):
+def test_position_file_rate_between_0_2_and_200_hz_is_plausible(read, rate):
     stamps = [str(round(1e9 * (0.98 * i / rate + 1795253650))) for i in range(ROWS)]
     file = read(table({"t": stamps, "x": X, "y": Y, "z": Z}))
     assert np.diff(file.samples.index) == pytest.approx(0.98 / rate, abs=1e-6)
@@ -210,7 +210,7 @@ def test_read_position_file_with_0_2_or_200_hz_adds_no_note(read, rate):
 
 
 @pytest.mark.parametrize("step", ["0.0001", "1e7"])
-def test_read_position_file_with_implausible_rate_adds_note(read, step):
+def test_position_file_of_implausible_sample_rate_adds_note(read, step):
     texts = [f"{float(step) * i:.6f}" for i in range(ROWS)]
     file = read(table({"time_s": texts, "x": X, "y": Y, "z": Z}))
     assert_stated(file, "s is unusual", "--position-time-unit")
@@ -393,7 +393,7 @@ def test_read_position_file_drops_backward_timestamps(read, shifts_us, dropped):
 
 
 @pytest.mark.parametrize("name", ["tag_id", "tagid", "node"])
-def test_read_position_file_with_two_tags_requires_body_option(read, name):
+def test_position_file_with_two_uwb_tags_requires_body_option(read, name):
     text = table({name: ["A1", "B2"] * (ROWS // 2), **PLAIN})
     assert "is selected: A1, B2. Choose a" in error_message(read, text)
     assert_track(read(text, body="B2"), rows=slice(1, None, 2))

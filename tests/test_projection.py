@@ -107,7 +107,7 @@ GONE = Unavailable("innovations", "none logged", "Log them.")
     (flight(uwb=Uwb(name="vehicle_mocap_odometry", origin=MOTION_CAPTURE_ORIGIN)), "north", WHOLE,
      "never fuses vehicle_mocap_odometry"),
 ], ids=["segment", "north", "east", "mocap"])  # fmt: skip
-def test_axis_without_ekf2_innovations_gives_reason(made, axis, segment, says) -> None:
+def test_ekf2_innovations_of_unlogged_axis_are_unavailable(made, axis, segment, says) -> None:
     (track,) = made.positions
     got = project_innovations(made, made.ekf2, track, axes_of(made)[axis], segment)
     assert isinstance(got, Unavailable)
@@ -132,7 +132,7 @@ def test_unlogged_measurement_noise_is_read_from_parameters() -> None:
     ({"EKF2_EVP_NOISE": 0.2, "EKF2_EV_NOISE_MD": 0.0}, (0.3, 0.3, 1.0), 0.3**2),
     ({"EKF2_EVP_NOISE": 0.2, "EKF2_EV_NOISE_MD": 1.0}, (0.3, 0.3, 1.0), 0.2**2),
 ])  # fmt: skip
-def test_ekf2_position_variance_follows_its_noise_parameters(
+def test_ekf2_measurement_variance_is_square_of_noise_parameter(
     parameters, reported_m, expected_m2
 ) -> None:
     made = flight(parameters=parameters)

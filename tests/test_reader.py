@@ -323,7 +323,7 @@ def test_ekf2_reset_counter_overflow_counts_as_one_reset(read, before):
 # ---- innovations ------------------------------------------------------------------------------
 
 
-def test_ekf2_innovation_without_variance_near_it_is_dropped(read):
+def test_innovation_without_variance_near_in_time_is_dropped(read):
     log = make_log("v1.12")
     late = log["estimator_innovation_variances"]
     kept = seconds_of(late["timestamp_sample"]) < 5.0
@@ -655,7 +655,7 @@ REAL = {
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", REAL)
-def test_read_log_of_real_logs_gives_their_duration_and_source(shared_logs, name):
+def test_read_log_of_real_logs_finds_duration_and_positions(shared_logs, name):
     duration_s, source = REAL[name]
     flight = read_log(shared_logs / "real" / f"{name}.ulg")
     assert flight.log.duration_s == pytest.approx(duration_s, abs=0.06)

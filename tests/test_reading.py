@@ -173,7 +173,7 @@ def test_error_about_file_name_with_line_feed_is_one_line(
 
 @pytest.mark.parametrize("command", OF_FILES)
 @pytest.mark.parametrize("path", ["folder", ".", "..", "/"])
-def test_command_with_folder_as_input_file_names_the_folder(
+def test_folder_given_as_input_file_is_named_in_the_error(
     desk, monkeypatch, capsys, command, path
 ) -> None:
     err = refusal(monkeypatch, capsys, desk, command.format(path))
@@ -185,7 +185,7 @@ def test_error_message_with_line_feeds_becomes_one_line() -> None:
     assert display_name(Path("logs") / "σ.ulg") == "σ.ulg"
 
 
-def test_files_of_folder_that_cannot_be_entered_are_listed(tmp_path, monkeypatch):
+def test_file_search_lists_files_of_folder_without_permission(tmp_path, monkeypatch):
     (tmp_path / "closed" / "subfolder").mkdir(parents=True)
     file = tmp_path / "closed" / "uwb.csv"
     file.touch()

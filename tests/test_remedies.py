@@ -134,7 +134,7 @@ def trial(after: RunStatistics, change: str = "sigma_z_m", kind: str = "noises")
         (13.3, 9.0, 0.5, "nothing", False),
     ],
 )
-def test_improvement_of_rerun_depends_on_nis_nees_and_rmse(
+def test_rerun_improvement_is_classified_by_nis_nees_and_rmse(
     nis, nees, rmse_m, expected, has
 ) -> None:
     one = trial(RunStatistics(nis_mean=nis, nees_mean=nees, position_rmse_m=rmse_m))
@@ -199,7 +199,7 @@ def test_recommended_ekf2_noise_and_delay_equal_estimates(sample: Analysis) -> N
     assert estimate_ekf2_parameters(other, model, sample.tuning, sample.time_offset) == {}
 
 
-def test_noise_below_reported_sigma_sets_ekf2_ev_noise_md(sample: Analysis) -> None:
+def test_advised_noise_below_vision_sigma_also_sets_ev_noise_md(sample: Analysis) -> None:
     model = sample.ekf2_model
     assert find_used_noise_m(model.inputs) == pytest.approx(0.1)
     flown = model.inputs.aid, model.inputs.settings, find_used_noise_m(model.inputs)
@@ -224,7 +224,7 @@ def only(name: str, analysis: Analysis) -> Finding:
     return finding
 
 
-def test_ekf2_delay_with_worse_replay_is_not_recommended(sample: Analysis) -> None:
+def test_ekf2_ev_delay_is_not_advised_if_rerun_is_worse(sample: Analysis) -> None:
     """The timestamps of the sample are correct; a replay with 150 ms is worse."""
     late = offset(sample, -0.15)
     assert not list(source_clock.detect(late))  # ground truth contradicts --clock-offset
@@ -233,7 +233,7 @@ def test_ekf2_delay_with_worse_replay_is_not_recommended(sample: Analysis) -> No
     assert finding.remedy == "Correct the position timestamps before sending."
 
 
-def test_height_noise_is_advised_if_it_differs_from_setting(sample: Analysis) -> None:
+def test_height_noise_advice_needs_estimate_far_from_setting(sample: Analysis) -> None:
     """The sample fuses the horizontal position only."""
     down = sample.tuning["down"]
     assert isinstance(down, AxisTuning)
@@ -248,7 +248,7 @@ def test_height_noise_is_advised_if_it_differs_from_setting(sample: Analysis) ->
     assert remedies.make_height_noise_advice(fused, tuning, 0.4) == ""
 
 
-def test_clock_offset_option_inside_interval_sets_ekf2_delay(sample: Analysis) -> None:
+def test_advised_delay_is_clock_offset_option_if_in_interval(sample: Analysis) -> None:
     clock = offset(sample, -0.145).time_offset  # the interval is ± 0.01 s
     for applied_s, expected_ms in ((0.0, 145.0), (-0.15, 150.0), (-0.2, 145.0)):
         clock = replace(clock, applied_s=applied_s)
@@ -271,7 +271,7 @@ def test_clock_offset_option_does_not_hide_wrong_gnss_delay(sample: Analysis) ->
     assert not list(source_clock.detect_wrong_delay(analysis, analysis.time_offset))
 
 
-def test_time_offset_action_first_advises_answering_timesync() -> None:
+def test_time_offset_advice_is_first_to_answer_mavlink_timesync() -> None:
     """PX4 ignores the timestamps of a sender that does not answer TIMESYNC."""
     for method, expected in ("arrival time", "Answer TIMESYNC"), ("TIMESYNC", "Subtract 0.400 s"):
         source: Any = SimpleNamespace(clock_map=SimpleNamespace(method=method))

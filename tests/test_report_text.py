@@ -36,7 +36,7 @@ def written(markdown: str) -> list[PageBlock]:
 
 
 @pytest.fixture
-def _fresh(monkeypatch: pytest.MonkeyPatch) -> Any:
+def _clear_font_caches(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Clear the cached fonts before and after the test."""
 
     def clear_caches() -> None:
@@ -59,7 +59,7 @@ def with_font(monkeypatch: pytest.MonkeyPatch, name: str, characters: str) -> No
     )
 
 
-@pytest.mark.usefixtures("_fresh")
+@pytest.mark.usefixtures("_clear_font_caches")
 def test_characters_missing_in_dejavu_use_an_installed_font(monkeypatch) -> None:
     with_font(monkeypatch, "Some Thai", THAI)
     assert fonts.find_missing_characters(f"Ångström σ Жанна {ARABIC} 5 ≤ 6") == ""
@@ -68,7 +68,7 @@ def test_characters_missing_in_dejavu_use_an_installed_font(monkeypatch) -> None
     assert fonts.find_missing_characters(f"{THAI} {HAN}") == HAN
 
 
-@pytest.mark.usefixtures("_fresh")
+@pytest.mark.usefixtures("_clear_font_caches")
 def test_characters_without_any_font_are_printed_as_squares(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -80,7 +80,7 @@ def test_characters_without_any_font_are_printed_as_squares(
     assert "fonts.google.com" in advice
 
 
-@pytest.mark.usefixtures("_fresh")
+@pytest.mark.usefixtures("_clear_font_caches")
 def test_fonts_that_draw_only_boxes_are_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
     own = font_manager.findfont(fonts.FONT)
     entries = [
@@ -129,12 +129,12 @@ def test_markdown_code_in_notes_keeps_spaces_and_dollar_signs() -> None:
         ("<div><p>a</p></div>\n\n<!-- no -->\n\nyes", ["a", "yes"]),
     ],
 )
-def test_markdown_in_notes_becomes_plain_text(markdown: str, read_as: list[str]) -> None:
+def test_markdown_in_student_notes_becomes_plain_text(markdown: str, read_as: list[str]) -> None:
     assert [block["text"] for block in written(markdown) if block["text"]] == read_as
 
 
 @given(st.text(st.sampled_from("#*-_`$|<>[]()!\\ \n1.ab{}^&;~="), max_size=80))
-def test_any_markdown_in_notes_is_accepted(text: str) -> None:
+def test_any_markdown_in_student_notes_is_converted(text: str) -> None:
     assert all(block["kind"] in ("text", "heading", "table") for block in written(text))
 
 

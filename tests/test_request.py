@@ -118,7 +118,7 @@ def test_compare_options_from_invalid_json_are_rejected(recorded: object, says: 
         (loop, requests.OPTION_NAMES[LoopRequest], (LoopRequest,)),
     ],
 )
-def test_each_command_option_has_a_field_in_the_python_request(command, declared, kinds) -> None:
+def test_each_command_option_has_a_field_in_python_api(command, declared, kinds) -> None:
     """An option that is not in the request would be missing in the results."""
     about_outputs = {
         "-o", "--json", "--student", "--id", "--notes", "--answers", "--fail-on", "--checks",

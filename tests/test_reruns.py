@@ -181,7 +181,7 @@ def test_ekf2_rerun_equals_what_if_with_the_same_parameters() -> None:
 rms_difference = attrgetter("main.difference.position_rms_m")
 
 
-def test_rerun_reports_kf_ekf2_difference_before_and_after() -> None:
+def test_rerun_reports_kf_ekf2_difference_before_and_after_fix() -> None:
     kf_case = flown(sigma_a=0.02)
     right = compare(kf_case.flight, replace(kf_case.settings, **cause(kf_case, "kf").change))
     row = cause(kf_case, "kf")
@@ -199,7 +199,7 @@ def test_rerun_reports_kf_ekf2_difference_before_and_after() -> None:
 
 
 @pytest.mark.slow
-def test_rerun_with_time_offset_shifts_times_of_outliers() -> None:
+def test_rerun_with_time_offset_also_shifts_excluded_outliers() -> None:
     analysis = flown("clock-offset=-0.19", "nlos=7%")
     count = cause(analysis, "ekf2").change[OUTLIERS_KEY]
     rows = [one for one in analysis.reruns if one.filter == "ekf2" and one.axis == "aisle"]
@@ -227,7 +227,7 @@ def test_ekf2_is_rerun_with_px4_default_of_each_changed_noise() -> None:
     assert tried[1:] == [{"EKF2_ACC_NOISE": 0.35}, {"EKF2_GYR_NOISE": 0.015}]
 
 
-def test_cause_must_explain_50_to_150_percent_of_log_mean_nis() -> None:
+def test_cause_must_explain_50_to_150_percent_of_ln_mean_nis() -> None:
     def one(change: Any, explains: float, *, into: bool = False) -> Rerun:
         after = RunStatistics(innovations=10 if into else 10**6, nis_mean=9.0 ** (1.0 - explains))
         return Rerun(

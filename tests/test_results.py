@@ -71,7 +71,7 @@ def test_results_json_of_any_settings_follows_the_schema(sample_flight, options)
     assert render_pdf(*made, text).startswith(b"%PDF-")
 
 
-def test_results_of_too_few_updates_give_reason_instead_of_zero(sample_flight):
+def test_nis_of_too_few_updates_is_unavailable_in_results(sample_flight):
     """One second of flight is too short for a test of consistency."""
     _, made = document(sample_flight, start_s=40.0, end_s=41.0)
     north = made.axes["north"]
@@ -187,7 +187,7 @@ def test_results_json_numbers_have_ten_significant_digits():
         assert to_json(json.loads(once)) == once
 
 
-def test_results_omit_number_outside_bounds_and_give_reason():
+def test_results_give_reason_for_number_outside_schema_limits():
     """An optional number is left out alone, a required one with its record."""
     results = read_results(json.dumps(EXAMPLE).encode())
     assert drop_invalid_numbers(results) == results

@@ -238,7 +238,7 @@ class TestForm:
 
 
 class TestScore:
-    def test_report_with_differing_numbers_earns_zero_points(self):
+    def test_report_that_differs_from_recomputed_one_earns_nothing(self):
         verdict = Verification("numbers differ", ("SIGMA_A is 0.5",), with_log=True)
         made = assess_results(verdict=verdict)
         assert {item.points for item in made.items} == {0.0}
@@ -334,7 +334,7 @@ class TestFeedback:
              ("pending, not counted yet",), "--logs"),
         ],
     )  # fmt: skip
-    def test_student_feedback_contains_status_but_no_flags(self, values, there, absent):
+    def test_student_feedback_omits_warnings_for_the_instructor(self, values, there, absent):
         text = feedback_words(graded(**values), "Lab 2")
         assert all(said in text for said in there), text
         assert absent not in text
@@ -386,7 +386,7 @@ def test_report_with_suspicious_settings_is_flagged(values, said):
         ("heading_drift_deg", 90.0, "--heading-drift is 90 ° per 100 m (default 3 °)."),
     ],
 )
-def test_loop_report_with_unusual_drift_option_is_flagged(option, stated, said):
+def test_drift_option_far_from_default_in_report_is_flagged(option, stated, said):
     found = list(
         flag_settings(decode_results(changed_results(LOOP, **{f"request__{option}": stated})))
     )

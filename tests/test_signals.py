@@ -81,7 +81,7 @@ def test_ned_acceleration_at_rest_is_zero_at_any_attitude(angles_deg):
 
 @pytest.mark.parametrize("axis", [(0, 0, 1), (0, 1, 0), (0.6, 0.0, 0.8)])
 @pytest.mark.parametrize("rate_rad_s", [0.5, -3.0])
-def test_ned_acceleration_of_rotating_body_stays_constant(axis, rate_rad_s):
+def test_ned_acceleration_is_recovered_on_rotating_body(axis, rate_rad_s):
     """Turning at a constant rate, the specific force is R(t)ᵀ(a − g); a must come back.
 
     The attitude is logged ten times slower than the IMU. Linear interpolation of quaternions has
@@ -337,7 +337,7 @@ def test_ekf2_reset_that_corrects_drift_remains_in_ekf2_state(reset_s):
     assert "undone" not in statement
 
 
-def test_ekf2_height_reset_is_kept_if_position_reset_is_removed():
+def test_removing_position_reset_keeps_ekf2_height_reset():
     frame_change = np.where(STATE_TIME >= 8.0, 3.0, 0.0)
     drift = np.where(STATE_TIME < 12.0, 0.1 * STATE_TIME, 0.0)
     offset = np.stack([frame_change, 0.0 * drift, drift], axis=1)
@@ -350,7 +350,7 @@ def test_ekf2_height_reset_is_kept_if_position_reset_is_removed():
     assert "height" in statement.split("EKF2 resets")[2]
 
 
-def test_height_reset_is_kept_if_source_has_no_height():
+def test_ekf2_height_reset_remains_if_positions_have_no_height():
     """A source without height contains no information on a change of the frame."""
     track = noisy_track()
     blind = replace(track, samples=track.samples.assign(down_m=np.nan))
@@ -378,7 +378,7 @@ def test_ekf2_resets_outside_evaluated_segment_are_not_removed(reset_s, said):
     assert bool(said) == bool(statement)
 
 
-def test_axis_label_states_largest_motion_or_heading() -> None:
+def test_main_axis_label_names_largest_motion_or_heading_option() -> None:
     flight = aisle_flight()
     labels = {axis.name: axis.label for axis in make_axes(flight, flight.positions[0], ALL)}
     assert (labels["north"], labels["aisle"]) == ("north", "the axis of largest motion")

@@ -130,7 +130,7 @@ class TestMotion:
 
 
 @pytest.mark.parametrize(("left_out", "texts"), [(0.0, []), (2.5, ["open-end=2.5m"])])
-def test_simulated_open_loop_has_requested_closure_error(left_out, texts):
+def test_simulated_loop_with_open_end_has_set_closure_error(left_out, texts):
     scenario = replace(LOOP, passes=2)
     flown = simulate(scenario, parse_faults(texts))
     first, last = flown.motion.compute_true_state(
@@ -237,7 +237,7 @@ class TestMistakes:
         assert np.mean(late[before]) == pytest.approx(0.25, abs=1e-3)
         assert np.allclose(late[~before], 0.0, atol=1e-6)
 
-    def test_simulated_nlos_outliers_have_exact_fraction(self):
+    def test_simulated_nlos_outliers_have_requested_fraction(self):
         simulation = simulate(Scenario(seed=6, sigma_uwb_m=0.0), parse_faults(["nlos=5%,3m"]))
         outlier, motion = simulation.positions.is_outlier, simulation.motion
         time = simulation.positions.measurement_times_s
@@ -356,7 +356,7 @@ def test_simulation_scenario_with_invalid_value_raises_error(changes):
     (Scenario(passes=100, length_m=100.0), [], "limited to 3600 s"),
     (AISLE, ["dropout=600s,0s"], "vehicle_visual_odometry contains no messages"),
 ])  # fmt: skip
-def test_simulate_fault_of_other_flight_kind_raises_error(scenario, texts, expected):
+def test_simulate_fault_unsuited_to_flight_kind_raises_error(scenario, texts, expected):
     with pytest.raises(SettingsError, match=expected):
         simulate(scenario, parse_faults(texts))
 

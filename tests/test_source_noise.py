@@ -123,7 +123,7 @@ def test_simulated_position_noise_is_found_with_type_and_size(
 
 
 @pytest.mark.parametrize("rate_hz", [5.0, 20.0])
-def test_noise_along_diagonal_is_found_with_its_direction(rate_hz) -> None:
+def test_direction_of_largest_horizontal_noise_is_reported(rate_hz) -> None:
     found = root_findings(analysed(diagonal_noise, rate_hz, passes=5))["source_noise_unequal_axes"]
     heading_deg = float(re.search(r"along (\d+)° from north and", found.message)[1])
     assert heading_deg == pytest.approx(135.0, abs=6.0)
@@ -140,7 +140,7 @@ def test_noise_variation_report_names_noisy_third_of_flight() -> None:
     assert end == pytest.approx(time[0] + 2.0 * third, abs=third / 3.0)
 
 
-def test_correlated_noise_is_distinguished_from_low_pass_filter() -> None:
+def test_correlated_noise_is_not_reported_as_low_pass_filtering() -> None:
     slow, smooth = analysed(SLOW), analysed(SMOOTH)
     assert "source_low_pass_filtered" not in {one.id for one in find(slow)}
     assert "source_noise_time_correlated" not in {one.id for one in find(smooth)}
@@ -167,7 +167,7 @@ def test_outliers_and_jumps_are_not_reported_as_correlated_noise() -> None:
     ("model", "sigma_z_m", "contradicts"),
     [(partial(errors.coloured, tau_s=20.0), 0.10, True), (errors.white, 0.14, False)],
 )
-def test_smaller_noise_is_advised_only_if_ground_truth_agrees(
+def test_smaller_noise_is_advised_only_if_nees_stays_consistent(
     model, sigma_z_m, contradicts
 ) -> None:
     """The estimate is 0.7 SIGMA_Z in both cases; the first one has time-correlated errors too."""
@@ -186,7 +186,7 @@ def test_smaller_noise_is_advised_only_if_ground_truth_agrees(
 
 
 @pytest.mark.parametrize(("tau_s", "seed"), [(5.0, 1), (20.0, 2)])
-def test_slow_position_error_is_found_only_with_ground_truth(tau_s: float, seed: int) -> None:
+def test_slowly_varying_position_error_is_found_only_with_truth(tau_s: float, seed: int) -> None:
     """Correlation times of IMU errors, so the innovations do not show them."""
     analysis = analysed(partial(errors.coloured, tau_s=tau_s), 5.0, seed, truth_for=0.10)
     found = root_findings(analysis)
@@ -228,7 +228,7 @@ def test_small_clock_jump_is_not_reported_as_correlated_noise() -> None:
     )
 
 
-def test_low_pass_report_contains_lag_below_time_constant() -> None:
+def test_low_pass_report_states_lag_of_first_order_filter() -> None:
     """Expected lag for steady motion: Δt ρ / (1 - ρ)."""
     found = root_findings(analysed(SMOOTH, 5.0))["source_low_pass_filtered"]
     assert found.evidence["lag_s"] == pytest.approx(0.2 / (np.exp(0.2 / 0.5) - 1.0), abs=0.06)
@@ -262,7 +262,7 @@ def test_fused_outliers_are_not_reported_as_noise_variation() -> None:
     assert list(detect_noise_variation(analysis)) == []
 
 
-def test_time_correlation_fit_without_imu_is_unavailable() -> None:
+def test_noise_correlation_time_without_imu_is_unavailable() -> None:
     analysis = analysed(MIXED)
     axis, given = analysis.axes["north"].axis, {"outlier_time_s": NONE, "clock_offset_s": 0.0}
     few = replace(axis, measurement_time_s=axis.measurement_time_s[:99],
@@ -276,7 +276,7 @@ def test_time_correlation_fit_without_imu_is_unavailable() -> None:
     )
 
 
-def test_time_correlation_fit_tries_zero_and_given_time_offset(
+def test_noise_correlation_fit_tries_0_and_applied_time_offset(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     analysis, tried = analysed(MIXED), []

@@ -90,7 +90,7 @@ def test_position_0_0_0_is_valid_if_track_passes_the_origin():
     assert invalid(samples) == {}
 
 
-def test_repeated_positions_are_valid():
+def test_positions_sent_twice_are_not_marked_invalid():
     samples = track()
     assert invalid(samples.set_axis(samples.index, axis=0).iloc[np.arange(60) // 2 * 2]) == {}
 
@@ -108,7 +108,7 @@ def test_rounding_step_of_float32_positions_is_found(origin, step):
     assert estimate_quantisation_step(values) < 0.01
 
 
-def test_rounding_step_is_zero_for_difference_below_float_range():
+def test_position_rounding_step_of_subnormal_difference_is_zero():
     assert estimate_quantisation_step(np.array([0.0, 5e-324, 1e10])) == 0.0
 
 
@@ -128,7 +128,7 @@ def test_constant_coordinate_is_reported_and_not_fused(column, name, severity, c
     assert ("down" in comparison.axes) is (column != "down_m")
 
 
-def test_source_with_three_constant_coordinates_is_not_fused():
+def test_constant_vision_positions_advise_to_disable_fusion():
     flight = simulate_flight(Scenario(passes=1, seed=2))
     flight = replace(flight, log=replace(flight.log, parameters={"EKF2_EV_CTRL": 15}))
     samples = flight.positions[0].samples.assign(north_m=1.0, east_m=1.0, down_m=1.0)
@@ -159,14 +159,14 @@ def test_read_log_detects_unit_and_clock_of_timestamps(tmp_path, stamp, clock):
     ("another clock", "Synchronise the clocks"),
     ("milliseconds", "Set timestamp_sample to the time of measurement"),
 ])  # fmt: skip
-def test_action_for_wrong_timestamps_depends_on_clock_or_unit(clock, action):
+def test_advice_on_timestamps_is_clock_sync_or_correct_unit(clock, action):
     (finding,) = source_stamps.detect_wrong_timestamp_unit_or_clock(
         compare(simulate_flight(Scenario(passes=1))), clock
     )
     assert action in finding.remedy
 
 
-def test_read_log_reads_reset_counter_and_quality(tmp_path):
+def test_read_log_reads_vision_reset_counter_and_quality(tmp_path):
     log = make_log("v1.16").drop("vehicle_visual_odometry")
     source = odometry("vehicle_visual_odometry", 10.0, 16)
     count = len(source.fields["timestamp"])
@@ -286,13 +286,13 @@ def test_invalid_position_values_are_the_only_reported_fault(name):
 
 
 @pytest.mark.parametrize("lost", [0, 1])
-def test_two_position_senders_report_contains_their_distance(lost):
+def test_report_on_positions_from_two_senders_states_distance(lost):
     (one,) = detected(alternating(aisle_flight(uwb=Uwb(rate_hz=10.0)), lost))
     assert one.evidence["distance_m"] == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.parametrize("is_fused", [0.0, 1.0])
-def test_finding_on_copied_ekf2_positions_contains_copy_delay(is_fused):
+def test_report_on_ekf2_positions_sent_back_states_their_delay(is_fused):
     flight = aisle_flight(ekf2=Estimator(fusing=((0.0, is_fused),)))
     first, *_ = detected(copied(flight))
     assert first.evidence["delay_s"] == pytest.approx(0.03, abs=0.01)
@@ -312,7 +312,7 @@ def test_wrong_timestamp_unit_report_shows_ekf2_never_fused():
     assert "the timestamps are in milliseconds" in second.title
 
 
-def test_equal_timestamps_report_contains_clock_resolution():
+def test_report_on_repeated_timestamps_states_clock_resolution():
     (one,) = detected(
         with_clock(aisle_flight(uwb=Uwb(rate_hz=1.0)), "local", REPEATED_TIMESTAMPS_NOTE, 120)
     )
@@ -331,7 +331,7 @@ def test_unfused_vision_report_shows_quality_below_ekf2_ev_qmin(quality, words):
     assert words in one.remedy
 
 
-def test_two_senders_finding_removes_or_explains_others():
+def test_positions_from_two_senders_explain_other_faults():
     analysis = unexplained(compare(aisle_flight()))
     findings = [
         finding("error", name, "m.", "r.")
@@ -342,7 +342,7 @@ def test_two_senders_finding_removes_or_explains_others():
     assert left[1].caused_by == "source_two_senders"
 
 
-def test_noise_on_one_axis_is_not_reported_as_two_senders():
+def test_noisy_axis_is_not_taken_for_positions_from_two_senders():
     flight = aisle_flight(uwb=Uwb(rate_hz=30.0, sigma_m=0.01))
     samples = flight.positions[0].samples.copy()
     samples["north_m"] += np.random.default_rng(9).normal(0.0, 0.4, len(samples))
@@ -385,7 +385,7 @@ def test_estimated_lever_arm_equals_simulated_one():
 
 
 @pytest.mark.parametrize(("rotation_deg", "has_truth"), [(10.0, True), (30.0, False)])
-def test_lever_arm_finding_advises_to_rotate_positions_first(
+def test_lever_arm_advice_first_rotates_misaligned_positions(
     rotation_deg: float, has_truth: bool
 ) -> None:
     analysis = mounted((0.3, 0.0), rotation_deg, AISLE)

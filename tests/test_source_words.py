@@ -37,7 +37,7 @@ def test_report_text_exists_for_each_position_source_kind() -> None:
         assert find_source_texts(SimpleNamespace(source=source)) is SOURCE_TEXTS[kind]  # type: ignore[arg-type]
 
 
-def test_fault_detectors_contain_no_sensor_specific_words() -> None:
+def test_fault_detector_texts_contain_no_sensor_specific_words() -> None:
     pattern = re.compile(r"\"[^\"]*(anchor|NLOS|line of sight|marker|reflection|multipath)", re.I)
     for file in FINDINGS.glob("*.py"):
         for line in file.read_text().splitlines():
@@ -56,6 +56,6 @@ def test_position_source_kind_is_guessed_from_noise_and_rate(rate_hz, sigma_m, k
     assert infer_position_kind(track(rate_hz, sigma_m).samples) == kind
 
 
-def test_source_with_few_samples_has_unknown_kind() -> None:
+def test_position_source_of_3_samples_has_unknown_kind() -> None:
     samples = pd.DataFrame(np.zeros((3, 3)), [0.0, 1.0, 2.0], Columns.POSITION)
     assert infer_position_kind(samples) == "unknown"

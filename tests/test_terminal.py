@@ -129,7 +129,7 @@ def test_text_output_modules_do_not_import_matplotlib() -> None:
 # --- commands ready to paste ---
 
 
-def test_printed_commands_contain_typed_files_and_options() -> None:
+def test_recommended_commands_contain_files_and_options_of_user() -> None:
     request = ComparisonRequest(
         log="my flights/a'b.ulg", position=PositionFile(path="u w/b.csv"),
         start_s=12.5, sigma_z_m=0.3,
@@ -225,7 +225,7 @@ def reported(made: ComparisonResults, **changes: object) -> str:
     return path.name
 
 
-def test_default_report_file_of_same_run_is_replaced(made) -> None:
+def test_default_report_of_same_log_and_settings_is_replaced(made) -> None:
     assert reported(made) == reported(made) == "aisle_uwb.pdf"
     assert reported(made, sigma_z_m=0.05) == "aisle_uwb_sigma-z-0.05.pdf"
     # a report without a student may be replaced by one with a student

@@ -95,7 +95,7 @@ def test_tune_finds_outliers_among_positions_not_used_in_fit() -> None:
     assert found.sigma_z.value == pytest.approx(0.1, rel=0.1)
 
 
-def test_true_noises_have_no_likelihood_gain_on_held_out_data() -> None:
+def test_noise_fit_has_no_held_out_gain_over_true_noise() -> None:
     gains = np.array([found.held_out.log_likelihood_gain_per_measurement for found in many()])
     assert np.mean(gains) < 0.0
     assert np.median(gains) <= 0.0
@@ -171,7 +171,7 @@ def test_noise_interval_ends_where_profile_likelihood_drops() -> None:
 
 
 @pytest.mark.parametrize("sigma_a", [0.05, 0.5])
-def test_tune_on_noise_free_positions_gives_sigma_z_upper_limit(sigma_a: float) -> None:
+def test_tune_on_exact_positions_gives_only_upper_noise_bound(sigma_a: float) -> None:
     found = tuned(modelled(3, 500, sigma_a=sigma_a, sigma_z=0.0))
     assert found.sigma_z.value is found.sigma_z.low is None
     assert SIGMA_Z_SEARCH_RANGE_M[0] <= found.sigma_z.high < 0.003

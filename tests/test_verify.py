@@ -164,7 +164,7 @@ def test_verify_accepts_report_of_other_operating_system(
     assert verdict.redrawn_pdf == aside
 
 
-def test_verify_accepts_numbers_that_differ_by_1e_12(aisle: VerifiedReport) -> None:
+def test_verify_accepts_recomputed_numbers_that_differ_by_1e_12(aisle: VerifiedReport) -> None:
     """Other kernels of OpenBLAS change results of the sample flights by 3e-8 at most."""
     scaled_results = read_again(scaled(json.loads(to_json(aisle.again[0])), -1e-12))
     elsewhere = (scaled_results, lambda: forged(aisle.pdf))
@@ -172,7 +172,7 @@ def test_verify_accepts_numbers_that_differ_by_1e_12(aisle: VerifiedReport) -> N
     assert verdict.outcome == "verified", verdict
 
 
-def test_verify_reports_numbers_that_differ_by_1e_4(aisle: VerifiedReport) -> None:
+def test_verify_reports_recomputed_numbers_that_differ_by_1e_4(aisle: VerifiedReport) -> None:
     """All numbers, except estimates, which have another tolerance, and those near zero."""
     ours = json.loads(to_json(aisle.again[0]))
     for share, least in ((1e-4, RESULT_RELATIVE_TOLERANCE), (1e-2, ESTIMATE_RELATIVE_TOLERANCE)):

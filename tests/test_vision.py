@@ -114,7 +114,7 @@ class PlainBias:
         self.signed += dt / (10.0 + dt) * (signed - self.signed)
 
 
-def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
+def run_reference_ekf(  # noqa: PLR0915 (one filter, read from top to bottom)
     inputs: ReplayInputs, segment: ReplaySegment, events: FusionEvents
 ) -> tuple[np.ndarray, np.ndarray]:
     """Run a plain EKF: one prediction at a time, each fix and each vision sample at its step.
@@ -230,13 +230,13 @@ def update_records(done: SegmentRun, at: int = 0) -> pd.DataFrame:
 @pytest.mark.parametrize(("rate_hz", "late_s", "settings"), [
     (30.0, 0.0, {}), (12.0, 0.1, {"EKF2_EV_DELAY": 100.0}), (30.0, 0.0, {"EKF2_EVP_NOISE": 0.8}),
 ])  # fmt: skip
-def test_ekf2_replay_of_vision_and_gnss_equals_reference(
+def test_ekf2_replay_of_vision_and_gnss_equals_kalman_filter(
     rate_hz: float, late_s: float, settings: dict[str, float]
 ) -> None:
     inputs = flying(sent(rate_hz, late_s=late_s), **settings)
     done, alone = ran(inputs), ran(replace(inputs, vision_positions=None))
     events = done.events[0]
-    fixes, rows = plain_both(inputs, done.segment, events)
+    fixes, rows = run_reference_ekf(inputs, done.segment, events)
     used = events.action > 0
     nu, S = done.innovation[used, 0, :5], done.innovation_variance[used, 0, :5]
     late = slice(30, None)  # after the transient of the bias
@@ -321,7 +321,7 @@ def test_ekf2_rejects_vision_jump_until_position_bias_is_reset() -> None:
     assert not update_records(without_gate)["rejected"].any()
 
 
-def test_vision_position_bias_restarts_after_a_gap() -> None:
+def test_ekf2_vision_position_bias_is_reset_after_vision_gap() -> None:
     vision = sent(sigma_m=0.05)
     at_s = float(on_gnss().inputs.segments[0].time_s[0]) + 20.0
     for gap_s, anew in ((0.9 * MAX_SAMPLE_GAP_S, False), (1.5 * MAX_SAMPLE_GAP_S, True)):
@@ -366,7 +366,11 @@ def test_vision_position_bias_changes_with_gnss_position_reset() -> None:
     for resets_velocity in (False, True):
         rules = replace(inputs.rules, resets_velocity=resets_velocity)
         done = ran(
-            replace(inputs, rules=rules, received_positions=off_by(inputs.received_positions, 30.0))
+            replace(
+                inputs,
+                rules=rules,
+                received_positions=add_position_jump(inputs.received_positions, 30.0),
+            )
         )
         # up to v1.16 any fused position, also from vision, prevents a reset to GNSS
         assert int(done.reset.sum()) == (not resets_velocity)
@@ -376,7 +380,7 @@ def test_vision_position_bias_changes_with_gnss_position_reset() -> None:
         assert update_records(done)["fused"].mean() > 0.999
 
 
-def off_by(received: ReceivedPositions, north_m: float) -> ReceivedPositions:
+def add_position_jump(received: ReceivedPositions, north_m: float) -> ReceivedPositions:
     """Return the positions with an offset from 15 s on."""
     start_s = float(on_gnss().inputs.segments[0].time_s[0])
     far = (received.timestamp_s > start_s + 15.0)[:, None] * np.array([north_m, 0.0, 0.0])
@@ -384,8 +388,10 @@ def off_by(received: ReceivedPositions, north_m: float) -> ReceivedPositions:
 
 
 def test_ekf2_resets_to_vision_if_gnss_and_vision_are_rejected() -> None:
-    inputs = flying(off_by(sent(sigma_m=0.05), 20.0), seconds=20.0)
-    done = ran(replace(inputs, received_positions=off_by(inputs.received_positions, 40.0)))
+    inputs = flying(add_position_jump(sent(sigma_m=0.05), 20.0), seconds=20.0)
+    done = ran(
+        replace(inputs, received_positions=add_position_jump(inputs.received_positions, 40.0))
+    )
     found = update_records(done)
     (reset_s,) = found.index[found["reset"] > 0.0]
     assert reset_s == pytest.approx(float(done.segment.time_s[0]) + 16.0, abs=0.2)
@@ -549,7 +555,7 @@ def test_what_if_without_gnss_uses_vision() -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"wrong_m": 1.0}, {"flipped": True}])
-def test_ekf2_model_excludes_vision_that_disagrees_with_log(wrong: dict[str, Any]) -> None:
+def test_ekf2_model_excludes_vision_if_replay_differs_from_log(wrong: dict[str, Any]) -> None:
     found = opened(flown(**wrong))
     assert "external vision" in format_replay_agreement(found.agreement)
     assert "ev_pos" in found.agreement.doubtful
@@ -575,7 +581,7 @@ def test_ekf2_model_does_not_fuse_vision_while_disabled() -> None:
     assert found.agreement.doubtful == {}
 
 
-def test_ekf2_model_with_incomplete_vision_is_unavailable() -> None:
+def test_ekf2_model_without_logged_vision_topic_is_unavailable() -> None:
     flight = flown()
     gnss_alone = replace(flight, positions=flight.positions[1:])
     lacking = prepare_ekf2_model(gnss_alone)
@@ -589,7 +595,7 @@ def test_ekf2_model_with_incomplete_vision_is_unavailable() -> None:
     assert "position increments of external vision" in refused.reason
 
 
-def test_kf_ekf2_difference_is_partly_explained_by_vision() -> None:
+def test_fused_vision_is_reported_as_part_of_kf_ekf2_difference() -> None:
     found = explained(model())
     for why in found.values():
         names = [step.name for step in why.steps]

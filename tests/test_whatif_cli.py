@@ -89,7 +89,7 @@ def test_what_if_with_unknown_aiding_source_raises_error(estimated: WhatIfAnalys
             what_if(model, [], without)
 
 
-def test_what_if_without_set_option_keeps_correct_parameters(estimated: WhatIfAnalysis) -> None:
+def test_what_if_without_set_option_proposes_no_needless_change(estimated: WhatIfAnalysis) -> None:
     """The UWB noise is 0.10 m, as EKF2 assumes, and its timestamps are right."""
     assert estimated.uses_estimates
     assert not estimated.changes
@@ -201,7 +201,7 @@ def test_what_if_table_omits_numbers_if_not_predictable(sample_flight: Flight) -
     assert "closest to 1" not in said
 
 
-def test_whatif_line_states_unit_or_band_twice_if_they_differ(swept: WhatIfAnalysis) -> None:
+def test_what_if_line_repeats_nis_band_only_if_bands_differ(swept: WhatIfAnalysis) -> None:
     changed, *others = swept.statistics.whatif
     north = replace(
         changed.axes["north"],

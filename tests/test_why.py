@@ -56,7 +56,7 @@ def test_position_difference_on_report_page_is_kf_minus_ekf2(sample: Analysis) -
     )
 
 
-def test_kf_setting_contributes_to_kf_ekf2_difference(sample: Analysis) -> None:
+def test_kf_setting_is_a_part_of_kf_ekf2_position_difference(sample: Analysis) -> None:
     plain = of(sample)
     zero = explain_again(sample, Settings(input="zero"))
     assert zero.steps[0].name == SAMPLE_TIMES_REPLACEMENT_NAME
@@ -79,14 +79,14 @@ def test_kf_setting_contributes_to_kf_ekf2_difference(sample: Analysis) -> None:
     assert [o.unexplained_mean_square_m2 for o in (zero, small, late)] == [left] * 3
 
 
-def test_kf_ekf2_difference_uses_only_evaluated_segment(sample: Analysis) -> None:
+def test_position_difference_uses_only_evaluated_segment(sample: Analysis) -> None:
     explanation = explain_again(sample, Settings(), start_s=30.0, end_s=60.0)
     assert explanation.spans_s[0][0] == pytest.approx(30.0, abs=0.2)
     assert explanation.spans_s[0][1] == pytest.approx(60.0, abs=0.3)
     assert of(sample).outside.at_s < of(sample).spans_s[0][0]
 
 
-def test_kf_ekf2_difference_without_replay_gives_reason(sample: Analysis) -> None:
+def test_kf_ekf2_difference_without_ekf2_replay_is_unexplained(sample: Analysis) -> None:
     down = compare(sample.flight, axes=("down",))
     found = explain_ekf2_difference(down, sample.ekf2_model, sample.time_offset, {})["down"]
     assert "horizontal" in found.reason
@@ -145,7 +145,7 @@ def test_kf_ekf2_difference_text_names_largest_contribution(sample, share, text)
     assert f" m (at {first.moved_at_s:.1f} s)" in explained.sentences[0]
 
 
-def test_kf_ekf2_difference_text_first_names_wrong_kf_setting(sample: Analysis) -> None:
+def test_report_on_kf_ekf2_difference_first_names_wrong_sigma_a(sample: Analysis) -> None:
     comparison = compare(sample.flight, Settings(sigma_a_m_s2=0.001), axes=("aisle",))
     corrected = find_corrected_noise_settings(comparison, sample.tuning)
     assert corrected == {"sigma_a_m_s2": pytest.approx(0.363, abs=0.01)}

@@ -73,7 +73,7 @@ def test_report_on_student_assignment_contains_no_diagnosis(assigned: Assigned) 
         "compare {log} --clock-offset auto",
     ],
 )
-def test_parameter_estimate_for_student_assignment_is_refused(
+def test_tune_sync_and_whatif_on_student_assignment_are_refused(
     assigned: Assigned, command: str
 ) -> None:
     assert DIAGNOSIS_WITHHELD.reason in error_line(*command.format(log=assigned.log).split())
@@ -89,7 +89,7 @@ def test_loop_command_on_student_assignment_hides_diagnosis(
 
 
 @pytest.mark.slow
-def test_grade_adds_diagnosis_to_report_on_student_assignment(
+def test_grade_gives_instructor_the_diagnosis_of_assigned_flight(
     assigned: Assigned, tmp_path: Path
 ) -> None:
     logs, pdf = hash_files([assigned.log]), assigned.report.read_bytes()
@@ -117,7 +117,7 @@ def test_report_on_log_without_its_assignment_key_is_rejected(
     assert "other log" in result.stdout
 
 
-def test_form_without_answers_on_plots_earns_part_of_points() -> None:
+def test_answer_form_without_plot_answers_earns_part_of_points() -> None:
     _, answer = simulate_assigned_flight(SECRET, Person("s01"), "aisle", 2)
     assert answer.form is not None
     complete = right(answer.form)

@@ -143,7 +143,7 @@ def at_rename_to(target: Path, monkeypatch: pytest.MonkeyPatch, act: Callable[[]
     monkeypatch.setattr(Path, "replace", replace)
 
 
-def deny() -> None:
+def raise_permission_error() -> None:
     """Raise the error of Windows for a file that another program has open."""
     raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
@@ -152,7 +152,7 @@ def test_write_error_lists_the_files_already_written(tmp_path, monkeypatch) -> N
     a, b, c = (tmp_path / name for name in "abc")
     for path in (a, b, c):
         path.write_bytes(b"old")
-    at_rename_to(b, monkeypatch, deny)
+    at_rename_to(b, monkeypatch, raise_permission_error)
     placed: list[Path] = []
     with pytest.raises(OutputError) as caught:
         write_output_files(dict.fromkeys((a, b, c), b"new"), placed.append)
@@ -179,7 +179,7 @@ def test_full_disk_leaves_no_empty_folder(tmp_path, monkeypatch) -> None:
 def test_output_to_locked_file_advises_to_close_the_program(tmp_path, monkeypatch) -> None:
     path = tmp_path / "r.pdf"
     path.write_bytes(b"old")
-    at_rename_to(path, monkeypatch, deny)
+    at_rename_to(path, monkeypatch, raise_permission_error)
     for locks, said in ((True, "Close the program that has the file open, or c"), (False, "C")):
         monkeypatch.setattr(writing, "OPERATING_SYSTEM_LOCKS_OPEN_FILES", locks)
         with pytest.raises(OutputError, match=rf"\. {said}hoose another"):
@@ -384,7 +384,7 @@ def test_command_with_closed_standard_output_exits_with_0(words: str) -> None:
 
 
 @posix
-def test_grade_of_a_named_pipe_is_refused(tmp_path: Path) -> None:
+def test_grade_command_with_named_pipe_as_input_is_refused(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     assert "is not a file or folder" in error_line("grade", pipe, "-o", tmp_path / "out")
