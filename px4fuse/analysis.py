@@ -12,6 +12,7 @@ from .core.record import display_html, one_line_repr
 from .ekf2.aids import AidResult
 from .ekf2.replay import Ekf2Replay
 from .ekf2.whatif import WhatIf
+from .errors import SettingsError
 from .finding import Finding
 from .flight.model import Flight, Unavailable
 from .loop.model import Loop
@@ -47,6 +48,16 @@ class Analysis(Comparison, Estimates, Reruns):
 
     def _repr_html_(self) -> str | None:
         return display_html(self)
+
+    def require_request(self) -> ComparisonRequest:
+        """Return the request, or raise SettingsError for an analysis without a request."""
+        if self.request is None:
+            raise SettingsError(
+                "The analysis contains no options of px4fuse.compare, which reports, web pages and "
+                "summaries need.",
+                "Pass an analysis from px4fuse.compare.",
+            )
+        return self.request
 
     @property
     def ekf2_replay(self) -> Ekf2Replay | Unavailable:

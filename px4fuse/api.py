@@ -294,7 +294,7 @@ def write_report(analysis: Analysis, path: Pathlike) -> Path:
     from .results.contract import to_json  # noqa: PLC0415
 
     report_path = _require_suffix(path, ".pdf")
-    serialisable_results = make_comparison_results(_require_request(analysis), analysis)
+    serialisable_results = make_comparison_results(analysis.require_request(), analysis)
     results_json = to_json(serialisable_results)
     pdf = render_pdf(analysis, serialisable_results, results_json)
     write_output_files({report_path: pdf, report_path.with_suffix(".json"): results_json.encode()})
@@ -314,7 +314,7 @@ def write_page(analysis: Analysis, path: Pathlike) -> Path:
     from .explore.page import make_analysis_page  # noqa: PLC0415 - slow import
 
     page_path = _require_suffix(path, ".html")
-    _require_request(analysis)
+    analysis.require_request()
     write_output_files({page_path: make_analysis_page(analysis).encode()})
     return page_path
 
@@ -331,15 +331,6 @@ def _require_suffix(path: Pathlike, suffix: str) -> Path:
     if output_path.suffix.lower() != suffix:
         raise OutputError(f"{output_path}: the name of the file must end in {suffix}.")
     return output_path
-
-
-def _require_request(analysis: Analysis) -> request.ComparisonRequest:
-    if analysis.request is None:
-        raise SettingsError(
-            "The analysis contains no settings, which a report or web page needs.",
-            "Pass an analysis from px4fuse.compare.",
-        )
-    return analysis.request
 
 
 def what_if(

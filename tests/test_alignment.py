@@ -478,7 +478,7 @@ def test_align_position_file_warns_of_second_time_offset() -> None:
     assert clock_error_s(alignment) < 0.03
     (warning,) = alignment.warnings
     assert re.match(
-        r"A second time offset [-+]19\.\d s from the estimate fits nearly as well", warning
+        r"A time offset that differs from the estimate by [-+]19\.\d s fits nearly as well", warning
     )
 
 

@@ -240,7 +240,6 @@ def test_diagnosis_explains_differing_nis_and_nees_verdicts() -> None:
         "position and σ",
     )
     assert card.reconcile == (
-        "The first fault on this card hardly changes the innovations of EKF2, but it increases "
-        "the errors against ground truth. A re-run without the first fault reduces the position "
-        "error."
+        "The main fault hardly changes the innovations of EKF2, but it increases the errors "
+        "against ground truth. A re-run without the main fault reduces the position error."
     )

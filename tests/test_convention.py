@@ -408,7 +408,7 @@ def test_ambiguous_position_axes_report_lists_possible_axes():
 
 
 @pytest.mark.parametrize(("axes", "message", "remedy"), [
-    (("north", "east", "up"), "The axes are not ENU: x is east, y north, z down",
+    (("north", "east", "up"), "The position axes are not ENU: x is east, y north, z down",
      "north = y, east = x, down = z"),
     (("west", "north", "down"), "NWU positions read as ENU: x is north, y west, z up",
      "frame nwu."),

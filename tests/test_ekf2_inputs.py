@@ -453,6 +453,6 @@ def test_ekf2_replay_segments_end_at_vision_and_imu_gaps(monkeypatch):
     [("EKF2_EVP_NOIS", "Did you mean EKF2_EVP_NOISE?"), ("EKF2_EV_CTRL", ""), ("EKF2_EV_QMIN", "")],
 )
 def test_parameter_error_suggests_name_only_if_it_is_mistyped(name: str, suggestion: str) -> None:
-    with pytest.raises(SettingsError, match=f"does not contain {name}, so") as raised:
+    with pytest.raises(SettingsError, match=f"does not contain the parameter {name}") as raised:
         check_parameters({name: 1.0})
     assert raised.value.remedy.startswith(f"{suggestion} Choose from".lstrip())

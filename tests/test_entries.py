@@ -161,7 +161,8 @@ def test_grade_with_two_different_answer_forms_is_pending() -> None:
     assert ada.total is None
     assert (
         ada.counted_report.instructor_action
-        == "The answer forms of 2 reports differ. Ask the student which report counts."
+        == "The student handed in 2 reports with different answer forms. Ask the student which "
+        "report counts."
     )
     assert len(ada.other_reports) == 1
     assert make_grades(files, Course(RUBRIC, attempt="best"))[0][0].total == 9.0
@@ -272,7 +273,11 @@ def test_instructor_overrides_replace_points_and_add_comments(tmp_path) -> None:
         "": GradeOverride(None, "Come and\nsee me."),
     }  # fmt: skip
     assert (ada.counted_report.points, ada.total, grace.total) == (15.5, 8.0, 3.0)
-    told = ("student 1 has no item 'C'", "student 2 has no item 'B'", "no student has the id 3")
+    told = (
+        "student 1 has no rubric item 'C'",
+        "student 2 has no rubric item 'B'",
+        "no student has the id 3",
+    )
     assert notes == tuple(f"overrides.csv: {one}." for one in told)
     text, reason = feedback_text(ada, "Lab"), "Because. Your instructor: A good idea."
     assert f"9.5 of 10  A\n    {reason} (Your instructor gave 9.5" in text

@@ -165,7 +165,7 @@ def test_explore_page_sliders_equal_values_of_shown_command(
         f"{name} {format_metres(north.filters[key].truth.position_rmse_m)} m"
         for key, name in FILTER_NAMES.items()
     ]
-    assert f"against ground truth, RMSE {', '.join(rmse)} ·" in title(page, "error")
+    assert f"position RMSE against ground truth: {', '.join(rmse)} ·" in title(page, "error")
 
 
 def test_explore_page_buttons_set_estimated_or_ekf2_noises(

@@ -211,6 +211,6 @@ def test_python_write_report_to_wrong_suffix_is_rejected(
         with pytest.raises(px4fuse.Px4FuseError, match=r"must end in \.(pdf|html)"):
             function(analysis, tmp_path / name)
     bare = dataclasses.replace(analysis, request=None)
-    with pytest.raises(px4fuse.Px4FuseError, match="contains no settings"):
+    with pytest.raises(px4fuse.Px4FuseError, match="contains no options of"):
         px4fuse.write_report(bare, tmp_path / "x.pdf")
     assert list(tmp_path.iterdir()) == []

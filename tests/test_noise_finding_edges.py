@@ -425,9 +425,9 @@ def test_smaller_kf_noise_that_increases_nees_is_not_advised() -> None:
         (fused(0.1), NoiseEstimate(0.3, 0.2, 0.4), {},
          "Set EKF2_EVP_NOISE to 0.3 m. EKF2 used a measurement noise of 0.1 m."),
         (fused(0.1), NoiseEstimate(0.124, 0.12, 0.13), {},
-         "EKF2's measurement noise (0.1 m) equals the estimated position"),
+         "Keep EKF2's measurement noise (0.1 m): it agrees with the estimate."),
         (fused(0.1, 0.2), NoiseEstimate(0.081, 0.08, 0.09), {},
-         "EKF2's measurement noise (0.1 m) equals"),
+         "Keep EKF2's measurement noise (0.1 m): it"),
         # a smaller noise than the sender reports: its variances must not be used
         (fused(0.3, 0.2), NoiseEstimate(0.1, 0.09, 0.11), {"EKF2_EVP_NOISE": 0.1},
          "Set EKF2_EV_NOISE_MD to 1. EKF2"),

@@ -429,9 +429,9 @@ def test_columns_option_overrides_detected_column_names(read, given, columns, fr
 @pytest.mark.parametrize(("options", "words"), [
     ({"time_unit": "min"}, "`time_unit`: 'min' is not one of s, ms, us, ns."),
     ({"length_unit": "ft"}, "`length_unit`: 'ft' is not one of m, cm, mm."),
-    ({"columns": ("time", "x")}, "four or five different columns"),
-    ({"columns": ("time", "x", "x", "z")}, "four or five different columns"),
-    ({"columns": ("time", "x", "y", "")}, "four or five different columns"),
+    ({"columns": ("time", "x")}, "three to five different columns"),
+    ({"columns": ("time", "x", "x", "z")}, "three to five different columns"),
+    ({"columns": ("time", "x", "y", "")}, "three to five different columns"),
     ({"columns": ("1", "2", "3", "9")},
      "no column '9'; the columns are 'time', 'x', 'y', 'z'. Name the columns with"),
     ({"columns": ("1", "2", "3", "9" * 5000)}, "no column '9999"),

@@ -77,13 +77,13 @@ BAD = {
     "a parameter of an earlier rubric": (ITEM + 'check = "consistent"\naxes = []', "field `axes`"),
     "titles equal except for case": (
         NOTES + NOTES.replace("T", "t"),
-        "the title 't' is not unique or is reserved",
+        "the item title 't' is not unique or is reserved",
     ),
     "title of the sum": (
         NOTES.replace("T", "Total"),
-        "the title 'Total' is not unique or is reserved",
+        "the item title 'Total' is not unique or is reserved",
     ),
-    "duplicate title": (NOTES + NOTES, "the title 'T' is not unique"),
+    "duplicate title": (NOTES + NOTES, "the item title 'T' is not unique"),
     "too many": (NOTES * 101, "length <= 100"),
     "invalid others_log": ('others_log = "maybe"\n' + NOTES, "`$.others_log`"),
     "too large": ("#" * 1_000_001, "more than the limit"),

@@ -258,9 +258,9 @@ class TestScore:
     @pytest.mark.parametrize("student_id", ["s02", "S02", "ѕ02", "s77", "", " "])
     def test_log_of_other_student_counts_only_if_rubric_allows(self, student_id):
         given = changed_results(student__id=student_id)
-        said = f"id in the report is {student_id}" if student_id.strip() else "report has no id"
+        said = f"the id {student_id}" if student_id.strip() else "no id"
         assert (
-            f"assigned to student s01, but the {said}"
+            f"assigned to student s01, but the report states {said}"
             in assess_results(given, key=key()).instructor_action
         )
         for rule, earns in (("zero", False), ("count", True)):

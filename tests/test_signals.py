@@ -361,7 +361,8 @@ def test_ekf2_height_reset_remains_if_positions_have_no_height():
     pd.testing.assert_frame_equal(state, ekf2.state)
     assert (
         statement
-        == "Jumps by EKF2 resets (1 of height) are kept: the resets correct an error of EKF2"
+        == "Jumps by EKF2 resets (1 of height) are kept in EKF2's track: the resets correct an "
+        "error of EKF2"
     )
 
 

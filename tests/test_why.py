@@ -129,7 +129,7 @@ def test_report_without_ekf2_replay_omits_difference_page(sample: Analysis) -> N
     ("share", "text"),
     [
         (0.47, "decreases by 47 % of its original value."),
-        (1.4, "decreases by 140 % of its original value. Other replaced"),
+        (1.4, "decreases by 140 % of its original value. Replacing other"),
     ],
 )
 def test_kf_ekf2_difference_text_names_largest_contribution(sample, share, text) -> None:

@@ -179,7 +179,7 @@ def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) 
     if compute_horizontal_range_m(convert_to_ned(samples, frames[0])) < MIN_MOTION_M:
         raise NoMatchError(
             f"the positions in the file change by less than {MIN_MOTION_M:g} m, too little "
-            "for a match"
+            "to match the log"
         )
     return min(
         (_match_with_reference(reference, frames, problem) for reference in references),

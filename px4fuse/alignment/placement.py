@@ -402,8 +402,9 @@ def _find_warnings(match: TrackMatch, is_yaw_estimated: bool) -> Iterator[str]:
         )
     if fit.second_to_best_residual_ratio < MIN_RESIDUAL_RATIO_WITHOUT_WARNING[reference_name]:
         yield (
-            f"A second time offset {fit.second_peak_lag_difference_s:+.1f} s from the estimate "
-            f"fits nearly as well (residual {fit.second_to_best_residual_ratio:.1f} times larger). "
+            "A time offset that differs from the estimate by "
+            f"{fit.second_peak_lag_difference_s:+.1f} s fits nearly as well (residual "
+            f"{fit.second_to_best_residual_ratio:.1f} times larger). "
             "Check the time offset, or set --clock-offset."
         )
     if is_yaw_estimated and reference_name == IMU_REFERENCE:

@@ -165,7 +165,8 @@ def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
     references = [_smooth_ekf2_track(state) for state in states]
     if max(map(compute_horizontal_range_m, references)) < MIN_MOTION_M:
         raise NoMatchError(
-            f"the EKF2 position changes by less than {MIN_MOTION_M:g} m, too little for a match"
+            f"the EKF2 position changes by less than {MIN_MOTION_M:g} m, too little to match the "
+            "position file"
         )
     return references
 

@@ -64,8 +64,8 @@ def analyse(job: Job) -> LogOutcome:
             outcome = _compare_log(job, path, sha256)
             if sha256 not in hash_files([path]):
                 raise LogError(
-                    "the file changed while it was read",
-                    "Run the same command again when the file is complete.",
+                    "the log changed while it was read",
+                    "Run the same command again after the log was written completely.",
                 )
             return outcome
     except Px4FuseError as error:

@@ -81,7 +81,7 @@ def format_differences(results: DiffResults) -> Page:
     for text in results.worse:
         page.write_labelled_text("Worse", styled_text(text, ERROR_COLOUR))
     if not results.worse:
-        page.write("Each error and each inconsistent filter of B is also in A.")
+        page.write("B has no error and no inconsistent filter that A does not have.")
     for finding in results.findings:
         styled_message = styled_text(
             f"{finding.severity}: {finding.message}", SEVERITY_COLOURS[finding.severity]
@@ -104,7 +104,8 @@ def format_differences(results: DiffResults) -> Page:
         f"{MIN_DIFFERENCE_OF_LISTED_NUMBERS:g}"
     )
     page.write_muted_text(
-        f"Differences below {tolerance_text} are not listed. --json FILE lists the other axes too."
+        f"Differences between A and B below {tolerance_text} are not listed. --json FILE lists "
+        "all axes."
     )
     return page
 

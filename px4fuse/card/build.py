@@ -87,8 +87,8 @@ OUTLIER_EXPLANATION = (
     "affect EKF2's position."
 )
 UNEXPLAINED_DIFFERENCE_TEXT = (
-    "For KF or EKF2, the ratios actual ÷ reported σ of innovations and against ground truth are "
-    "different. No re-run of the filters explains the difference."
+    "For KF or EKF2, innovations and ground truth give different ratios of actual to reported σ. "
+    "No re-run of the filters explains the difference."
 )
 # Reasons why faults of the source increase errors, but hardly change innovations
 SOURCE_FAULT_EXPLANATIONS = (
@@ -417,7 +417,7 @@ def _format_action(action: Action) -> str:
         options_text = action.commands[0].partition(" --")[2]
         return f"KF: run again with --{options_text}"
     text = lowercase_first_letter(action.sentence.rstrip("."))
-    return f"{action.target}: {text}"
+    return f"{action.target_name}: {text}"
 
 
 def _mark_explained_verdicts(
@@ -516,9 +516,9 @@ def _explain_differing_verdicts(
     if filters_affected_by_fault.issuperset(filters_with_differing_ratios):
         filter_labels = " and ".join(FILTER_NAMES[name] for name in filters_with_differing_ratios)
         return (
-            f"The first fault on this card hardly changes the innovations of {filter_labels}, but "
-            "it increases the errors against ground truth. A re-run without the first fault "
-            "reduces the position error."
+            f"The main fault hardly changes the innovations of {filter_labels}, but it increases "
+            "the errors against ground truth. A re-run without the main fault reduces the "
+            "position error."
         )
     if analysis.source.origin.may_drift:
         return (
@@ -549,10 +549,9 @@ def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCau
         if "position" in classify_improvement(rerun) or not can_show_effect(rerun)
     }
     if len(filters_affected_by_fault) == 2:
-        fault_text = "The first fault" if len(ranked_causes) > 1 else "The fault"
         return (
-            f"{difference_text}. {fault_text} affects both KF and EKF2, so the difference "
-            "KF − EKF2 hardly shows the fault."
+            f"{difference_text}. The main fault affects both KF and EKF2, so the difference "
+            "KF − EKF2 hardly shows this fault."
         )
     corrected_filter: FilterName = "kf"
     if filters_affected_by_fault == {"ekf2"} or all(rerun.filter == "ekf2" for rerun in reruns):

@@ -428,7 +428,7 @@ def _format_closing_sentence(useful_reruns: Sequence[Rerun], *, has_alternatives
         and classify_sigma_ratio(min(sigma_ratios_against_truth), "truth") == "overconfident"
     ):
         return (
-            "After the tested change, the reported σ is still too small against ground truth: "
-            "another error remains."
+            "Even in the best re-run, the reported σ is too small against ground truth: another "
+            "error remains."
         )
     return ""

@@ -116,6 +116,10 @@ class Action(Record):
     where: Literal["shell", "console", ""] = ""
 
     @property
+    def target_name(self) -> str:
+        return "position source" if self.target == "source" else self.target
+
+    @property
     def keeps_settings(self) -> bool:
         return self.sentence.startswith("keep the settings")
 

@@ -29,7 +29,7 @@ def parse_delta(text: str) -> RpePairDistance:
     match = _DELTA_PATTERN.fullmatch(text.strip())
     if match is None or not 0.0 < float(match[1]) <= MAX_RPE_DELTA:
         raise click.BadParameter(
-            f"The delta {text!r} is not a distance (5m), a time (10s) or a number of frames (1f)."
+            f"The RPE delta {text!r} is not a distance (5m), time (10s) or number of frames (1f)."
         )
     unit = {"m": "m", "s": "s"}.get(match[2], "frames")
     return RpePairDistance(float(match[1]), unit)  # type: ignore[arg-type]

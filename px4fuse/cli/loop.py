@@ -42,7 +42,7 @@ def parse_landing(text: str) -> Landing:
     return Landing(
         *_parse_numbers(
             text,
-            "FORWARD,RIGHT (distances in m) or FORWARD,RIGHT,DEG (and rotation in °)",
+            "FORWARD,RIGHT (m from take-off) or FORWARD,RIGHT,DEG (and heading change in °)",
             MAX_LANDING_DISTANCE_M,
         )
     )
@@ -52,7 +52,7 @@ def parse_closure(text: str) -> GivenClosure:
     """Parse a loop closure: ``T1,T2`` (s) or ``T1,T2,SIGMA`` (m)."""
     return GivenClosure(
         *_parse_numbers(
-            text, "T1,T2 (times at one place, s) or T1,T2,SIGMA (σ in m)", sys.float_info.max
+            text, "T1,T2 (times at the same place, s) or T1,T2,SIGMA (σ in m)", sys.float_info.max
         )
     )
 

@@ -320,7 +320,7 @@ filter_options = _combine_options(
     ),
     _comparison_option(
         "heading_deg",
-        "Heading (°, clockwise from north) of the axis aisle.  [default: axis of largest motion]",
+        "Heading (°, clockwise from north) of --axis aisle.  [default: axis of largest motion]",
     ),
     _comparison_option(
         "start_s",

@@ -149,7 +149,8 @@ class CommandWithFaultTable(click.Command):
 @click.option(
     "--yaw",
     type=Choice(get_args(YawMode)),
-    help="Heading: fixed, or follow the flight direction.  [default: fixed; follow on a square]",
+    help="Heading: fixed, or follow the flight direction.  [default: fixed, but follow "
+    "on a square path]",
 )
 @_add_scenario_options
 def simulate(

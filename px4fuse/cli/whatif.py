@@ -77,7 +77,7 @@ def parse_sweep(text: str) -> Sweep:
     "start_s",
     type=options.NumberWithUnit("s"),
     metavar="SECONDS",
-    help="Time (s after the first sample) from which --without applies.  [default: 0]",
+    help="Start of the time without AID (s after the first sample).  [default: 0]",
 )
 @options.system_option
 @options.max_size_option

@@ -203,7 +203,7 @@ def _describe_replacement_effect(
     replacement: PropertyReplacement, explanation: DifferenceExplanation
 ) -> str:
     explained_fraction = replacement.position_mean_square_m2 / explanation.position_mean_square_m2
-    increase_text = " Other replaced properties increase the difference."
+    increase_text = " Replacing other properties of KF increases the difference."
     return (
         f"If KF uses EKF2's {replacement.name}, KF's position changes by up to "
         f"{replacement.position_moved_m:.2f} m (at {replacement.moved_at_s:.1f} s), and the mean "
@@ -248,7 +248,7 @@ def _describe_property_differences(
             for offset_s in (time_offset.offset_s, *time_offset.interval_s[::-1])
         )
         delay_text += (
-            f". The maximum-likelihood estimate is {estimated_age_ms:.0f} ms (95 % {low_ms:.0f} to "
+            f". The maximum-likelihood age is {estimated_age_ms:.0f} ms (95 % {low_ms:.0f} to "
             f"{high_ms:.0f} ms)"
         )
     acc_noise = parameters["EKF2_ACC_NOISE"]

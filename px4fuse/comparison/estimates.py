@@ -33,7 +33,7 @@ from px4fuse.filter.time_offset import (
     estimate_time_offset,
 )
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
-from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
+from px4fuse.flight.model import DIAGNOSIS_WITHHELD, FULL_IMU_RATE_ACTION, Flight, Unavailable
 
 from .imu_oscillation import ImuOscillation, find_imu_oscillation
 from .model import Comparison, PreparedComparison
@@ -340,7 +340,7 @@ def explain_low_imu_rate(flight: Flight) -> Unavailable | None:
     if rate_hz >= MIN_MEASURED_TO_NOMINAL_IMU_RATE_RATIO * required_hz:
         return None
     rate_note = f"the IMU was logged at {rate_hz:.3g} Hz"
-    remedy = "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate."
+    remedy = FULL_IMU_RATE_ACTION
     if is_telemetry:
         rate_note = f"telemetry contains only some of the IMU samples ({rate_hz:.3g} Hz)"
         remedy = f"Request the IMU message at {required_hz:g} Hz."

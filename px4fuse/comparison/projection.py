@@ -89,7 +89,7 @@ def remove_origin_resets(
                 removed_texts,
                 "removed from EKF2's track: the resets only move the origin of EKF2's frame",
             ),
-            (kept_texts, "kept: the resets correct an error of EKF2"),
+            (kept_texts, "kept in EKF2's track: the resets correct an error of EKF2"),
         )
         if texts
     )

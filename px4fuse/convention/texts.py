@@ -69,7 +69,7 @@ def describe_axes(
     """
     x, y, z = axes
     frame_name = next((frame for frame in FRAME_AXES if FRAME_AXES[frame] == axes), "")
-    title = f"The axes are not {stated_frame}"
+    title = f"The position axes are not {stated_frame}"
     if frame_name:
         title = f"{frame_name} positions {'read' if is_file else 'sent'} as {stated_frame}"
     fault = f"{title}: x is {x}, y {y}, z {z}{' (left-handed frame)' if is_mirrored else ''}"

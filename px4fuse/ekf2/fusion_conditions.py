@@ -45,6 +45,8 @@ CLOCK_SYNCHRONISATION_ACTION = (
     "Synchronise the clocks: set UXRCE_DDS_SYNCT to 1 (uXRCE-DDS agent), or answer MAVLink "
     "TIMESYNC messages. Send timestamps in microseconds."
 )
+CHECK_SOURCE_ACTION = "Check the position source and its data link."
+POSITION_RATE_ACTION = "Send the position at 10 Hz."
 EFFECT_OF_TOO_OLD_TIMESTAMPS = "The position timestamps are too old for EKF2."
 EFFECT_OF_TIMESTAMPS_AHEAD_OF_CLOCK = "The position timestamps are ahead of EKF2's clock."
 # Effect on EKF2 of timestamps in a wrong unit
@@ -220,7 +222,7 @@ def _check_position_gap(positions: UnfusedPositions) -> Iterator[UnmetCondition]
             "gap",
             f"no position for {duration_s:.1f} s from {last_position_time_s:.1f} s on",
             f"EKF2 stops fusion {stop_timeout_s:g} s after the last position.",
-            "Check the position source and its data link.",
+            CHECK_SOURCE_ACTION,
         )
 
 
@@ -235,7 +237,7 @@ def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     if clock_map and (clock := clock_map.clock) in EFFECT_BY_UNUSABLE_TIMESTAMP:
         yield UnmetCondition(
             "clock",
-            "the timestamps are 0" if clock == "0" else f"the timestamps are in {clock}",
+            f"the position timestamps are {'' if clock == '0' else 'in '}{clock}",
             EFFECT_BY_UNUSABLE_TIMESTAMP[clock],
             find_timestamp_action(clock),
         )
@@ -316,7 +318,7 @@ def _check_interval(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
             f"the positions come at {positions.source.compute_rate_hz():.2g} Hz",
             "EKF2 (v1.14 and later) starts to fuse external vision only when two positions come "
             f"within {EV_START_INTERVAL_S:g} s. No parameter changes this minimum rate.",
-            "Send the position at 10 Hz.",
+            POSITION_RATE_ACTION,
         )
 
 
@@ -395,7 +397,7 @@ def _check_gate(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
         yield UnmetCondition(
             "gate",
             f"EKF2 rejects {100.0 * rejected_fraction:.0f} % of the positions",
-            "The innovations are beyond EKF2's gate of "
+            "The position innovations exceed EKF2's gate of "
             f"{positions.parameters.get(aid.gate, aid.default_gate):g} √S.",
             f"Check the frame of the positions, {aid.delay} and {aid.noise}. Increase {aid.gate} "
             "only if all three are correct.",

@@ -28,6 +28,8 @@ from px4fuse.flight.ekf2_parameters import (
 )
 from px4fuse.flight.model import (
     DEAD_RECKONING_FLAG,
+    FASTER_LOGGING_ACTION,
+    FULL_IMU_RATE_ACTION,
     POSITION_FILE_ORIGIN,
     Columns,
     Ekf2,
@@ -260,10 +262,10 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     ]:
         return Unavailable(
             ANALYSIS_NAME,
-            f"EKF2 also fused {', '.join(unmodelled_aids)}, which the model does not contain",
-            "Disable this fusion before the next flight (EKF2_OF_CTRL 0, "
-            f"{'' if is_gnss else 'EKF2_GPS_CTRL 0, '}"
-            "or bit 2 (velocity) of EKF2_EV_CTRL cleared).",
+            f"EKF2 also fused {', '.join(unmodelled_aids)}, which the replay does not contain",
+            "Before the next flight, disable optical flow (EKF2_OF_CTRL 0), "
+            f"{'' if is_gnss else 'GNSS (EKF2_GPS_CTRL 0) '}"
+            "or vision velocity (bit 2 of EKF2_EV_CTRL).",
         )
     if missing_imu := _explain_missing_imu(imu.index.to_numpy()):
         return missing_imu
@@ -371,13 +373,13 @@ def _explain_missing_imu(time_s: Array) -> Unavailable | None:
         return Unavailable(
             ANALYSIS_NAME,
             f"the IMU is logged at {1.0 / median_interval_s:.0f} Hz, below EKF2's prediction rate",
-            "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate.",
+            FULL_IMU_RATE_ACTION,
         )
     if (lost_fraction := compute_lost_imu_fraction(time_s)) > MAX_MISSING_IMU_FRACTION:
         return Unavailable(
             ANALYSIS_NAME,
             f"{100.0 * lost_fraction:.0f} % of the IMU samples are missing from the log",
-            "Use a faster SD card, or log fewer topics (SDLOG_PROFILE).",
+            FASTER_LOGGING_ACTION,
         )
     return None
 

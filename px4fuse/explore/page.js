@@ -240,8 +240,8 @@ const Explore = (async () => {
     const both = (name, format) => [["KF", kf?.[name]], ["EKF2", ekf2[name]]]
       .filter(([, value]) => Number.isFinite(value)).map(([filter, value]) => `${filter} ${format(value)}`).join(", ");
     title("innovation", `innovations outside ±2√S (expected 5 %): ${both("outside", (x) => `${(100 * x).toFixed(0)} %`)}`);
-    const rms = axis.truth ? `against ground truth, RMSE ${both("rmse", Card.formatMetres)}`
-      : `position difference KF − EKF2, RMS ${both("differenceRms", Card.formatMetres)}`;
+    const rms = axis.truth ? `position RMSE against ground truth: ${both("rmse", Card.formatMetres)}`
+      : `RMS position difference KF − EKF2: ${both("differenceRms", Card.formatMetres)}`;
     title("error", `${rms} · shaded: ±2σ reported by KF, hatched: gap in the position source`);
   }
 

@@ -36,7 +36,7 @@ from .settings import Settings
 from .signals import Acceleration, Axis, report_too_few_measurements
 from .steps import make_prediction_steps
 
-ANALYSIS_NAME = "biases, scale factor error and jumps"
+ANALYSIS_NAME = "accelerometer bias, scale factor error and position jumps"
 MIN_MEASUREMENTS = 50
 # Prior σ (rad) of the slow tilt error of the logged attitude
 TILT_PRIOR_SIGMA_RAD = 0.002

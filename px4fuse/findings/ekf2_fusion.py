@@ -17,8 +17,10 @@ from px4fuse.core.record import Span
 from px4fuse.core.text import format_metres, format_number, format_ratio
 from px4fuse.ekf2.aids import INNOVATION_MEAN_WINDOW_S, AidResult
 from px4fuse.ekf2.fusion_conditions import (
+    CHECK_SOURCE_ACTION,
     EV_START_INTERVAL_S,
     EV_STOP_INTERVAL_S,
+    POSITION_RATE_ACTION,
     UnfusedPositions,
     find_unmet_condition,
     is_height_only,
@@ -77,7 +79,7 @@ ACTION_BY_SWITCH = {
     "EKF2_RNG_CTRL": "Fly within the range of the distance sensor.",
     "EKF2_OF_CTRL": "Fly over a textured and lit floor.",
     "EKF2_MAG_TYPE": "Mount the magnetometer away from motors and power cables.",
-    "EKF2_EV_CTRL": "Check the position source and its data link.",
+    "EKF2_EV_CTRL": CHECK_SOURCE_ACTION,
 }
 DEFAULT_ACTION = "Check mounting and power supply of the sensor."
 
@@ -193,7 +195,7 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
     distance_sentence = ""
     if np.isfinite(distance_m):
         distance_sentence = (
-            f" The invalid position is up to {format_metres(distance_m)} m from the {reference}."
+            f" EKF2's invalid position is up to {format_metres(distance_m)} m from the {reference}."
         )
     yield finding(
         error_if(invalid_fraction > 1.0 - MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR),
@@ -253,7 +255,7 @@ def _detect_slow_restart(analysis: PreparedComparison, fusion_flag: pd.Series) -
             f"After a gap EKF2 resumed fusion {longest_delay_s:.1f} s late: "
             f"{source.positions_text} come at only {rate_hz:.1f} Hz. EKF2 (v1.14 and later) "
             f"starts fusion when two positions arrive within {EV_START_INTERVAL_S:g} s.",
-            "Send the position at 10 Hz.",
+            POSITION_RATE_ACTION,
             {"rate_hz": rate_hz, "longest_s": longest_delay_s, "count": len(delay_spans)},
             tuple(delay_spans),
         )

@@ -78,7 +78,7 @@ def detect_impossible_acceleration(analysis: Analysis) -> Findings:
         "first at "
         f"{start_s:.1f} s. Sensors of autopilots measure at most 32 g (314 m/s²). The simulator "
         "has diverged, or the log is damaged.",
-        "Analyse only the time before the impossible values "
+        "Analyse only the time before the impossible accelerometer values "
         f"(--end {max(start_s - 1.0, 0.0):.1f}).",
         {"max_m_s2": max_specific_force_m_s2, "count": len(times_s), "at_s": start_s},
         ((start_s, times_s[-1]),),

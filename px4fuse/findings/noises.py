@@ -461,7 +461,7 @@ def _find_sigma_action_without_replay(
     ratio = used_noise_m / noise_m if ekf2_summary.sigma_ratio < 1.0 else noise_m / used_noise_m
     if not ratio > MAX_RATIO_OF_EQUAL_NOISES:  # the comparison is False for NaN
         return (
-            f"EKF2's measurement noise ({used_noise_m:.2g} m) equals the estimated position noise. "
+            f"Keep EKF2's measurement noise ({used_noise_m:.2g} m): it agrees with the estimate. "
             "Check the time offset (px4fuse sync LOG) and the IMU (gaps, vibration)."
         )
     parameters, reported_noise_m = analysis.flight.log.parameters, 0.0

@@ -6,7 +6,13 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.text import capitalise_first_letter, format_number
 from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
-from px4fuse.flight.model import AS_RECEIVED_ORIGIN, Ekf2, Flight, Unavailable
+from px4fuse.flight.model import (
+    AS_RECEIVED_ORIGIN,
+    FASTER_LOGGING_ACTION,
+    Ekf2,
+    Flight,
+    Unavailable,
+)
 
 from .model import Findings, format_occurrences, make_note, make_warning
 
@@ -38,7 +44,7 @@ def detect_dropouts(analysis: PreparedComparison) -> Findings:
             "logger_dropouts",
             f"The logger lost {sum(durations_s):.2f} s of data. Number of dropouts: {len(spans)}, "
             f"longest dropout: {max(durations_s):.2f} s.",
-            "Use a faster SD card, or log fewer topics (SDLOG_PROFILE).",
+            FASTER_LOGGING_ACTION,
             {"count": len(spans), "total_s": sum(durations_s)},
             spans,
         )

@@ -148,9 +148,9 @@ def _detect_position_faults(
     is_position_file = source.alignment is not None
     log_odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
     evidence_sentence = (
-        "Of all tested combinations of axes, unit and time offset, the corrected one fits the IMU "
-        f"best (log likelihood ratio to the second best: {'above ' if log_odds == 99.0 else ''}"
-        f"{log_odds:.0f} nats)."
+        "With corrected axes, unit and time offset, the positions fit the IMU better than with "
+        "other tested combinations (log likelihood ratio to the second best: "
+        f"{'above ' if log_odds == 99.0 else ''}{log_odds:.0f} nats)."
     )
     stated_frame = source.alignment.frame.upper() if source.alignment else "NED"
     axes = find_axes_in_file(convention.axes, stated_frame)

@@ -281,8 +281,8 @@ def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: Err
             f"{format_metres(periodic_error.amplitude_m)} m, period {periodic_error.period_s:.1f} "
             f"s. This sinusoid explains {format_percent(min(periodic_error.fraction, 1.0))} of the "
             "slow errors against ground truth. Innovations hardly show this error.",
-            f"{find_source_texts(analysis).slow_error_check}. Look for a process with this "
-            "period, such as a control loop.",
+            f"{find_source_texts(analysis).slow_error_check}. Look for a process with the "
+            "period of the error, such as a control loop.",
             periodic_error._asdict(),
         )
         return

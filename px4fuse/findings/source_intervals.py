@@ -17,7 +17,13 @@ from px4fuse.ekf2.fusion_conditions import EV_START_INTERVAL_S
 from px4fuse.filter.kalman import predict_track
 from px4fuse.finding import Finding
 from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, Aid
-from px4fuse.flight.model import ALIGNED_BY_EKF2_ORIGIN, Ekf2, Unavailable, sample_step_function
+from px4fuse.flight.model import (
+    ALIGNED_BY_EKF2_ORIGIN,
+    FASTER_LOGGING_ACTION,
+    Ekf2,
+    Unavailable,
+    sample_step_function,
+)
 from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 
 from .model import (
@@ -110,7 +116,7 @@ def _find_action_for_unlogged_positions(analysis: Analysis, start_s: float, end_
         if track.origin.aid == analysis.source.origin.aid and len(track.samples[start_s:end_s]) > 2:
             return f"Run again with --position-source {track.name}, which contains these positions."
     if analysis.flight.log.dropouts:
-        return "Use a faster SD card, or log fewer topics (SDLOG_PROFILE)."
+        return FASTER_LOGGING_ACTION
     return "Log fewer topics (SDLOG_PROFILE)."
 
 
@@ -121,10 +127,10 @@ def _make_source_stops_or_begins_finding(
     duration_s, effect_sentence, action = end_s - start_s, "", ""
     if end_s == analysis.segment.whole_flight.end_s:
         finding_id, event, event_s = "source_stops", "stop", start_s
-        before_or_after, start_or_end_text = "after", "before the end"
+        before_or_after = "after"
     else:
         finding_id, event, event_s = "source_begins", "begin", end_s
-        before_or_after, start_or_end_text = "before", "after the start"
+        before_or_after = "before"
         action = "" if source.alignment else " Take off only when positions arrive."
     ekf2_errors_at_end = _find_ekf2_errors_at_end(analysis, span_s)
     # The error, if known, or else the reported σ
@@ -141,8 +147,8 @@ def _make_source_stops_or_begins_finding(
     return finding(
         error_if(is_dead_reckoning),
         finding_id,
-        f"{source.positions_text} {event} in flight at {event_s:.1f} s, {duration_s:.1f} s "
-        f"{start_or_end_text} of the flight.{aiding_sentence}{effect_sentence}",
+        f"{source.positions_text} {event} in flight at {event_s:.1f} s, so {duration_s:.1f} s of "
+        f"the flight have no positions.{aiding_sentence}{effect_sentence}",
         f"{find_source_texts(analysis).data_link_check} for the time {before_or_after} "
         f"{event_s:.1f} s.{action}",
         {"at_s": event_s, "duration_s": duration_s, **ekf2_errors_at_end},
@@ -179,10 +185,10 @@ def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
     if isinstance(result.truth, pd.DataFrame):
         true_m = result.truth["position_m"]
         reference_m = float(np.interp(end_s, true_m.index, true_m))
-        quantity = "Position error at the end of the gap,"
+        quantity = "Position error at the end of the gap"
     else:
         reference_m = float(axis.measurement_m[np.searchsorted(axis.measurement_time_s, end_s)])
-        quantity = "Distance from the estimate to the first position after the gap,"
+        quantity = "Distance from the estimated to the first measured position after the gap"
     ekf2_text, aiding_sentence = "", "In the gap KF relies on the IMU alone."
     if isinstance(ekf2_state, pd.DataFrame) and len(
         positions_before := ekf2_state["position_m"].loc[:end_s]
@@ -205,7 +211,7 @@ def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
     kf_error_m = abs(kf_track["position_m"] - reference_m)
     kf_sigma_m = kf_track["position_variance_m2"] ** 0.5
     return (
-        f"{aiding_sentence} {quantity} along {axis.label}: {ekf2_text}KF "
+        f"{aiding_sentence} {quantity}, along {axis.label}: {ekf2_text}KF "
         f"{format_metres(kf_error_m)} m (σ {format_metres(kf_sigma_m)} m)."
     )
 

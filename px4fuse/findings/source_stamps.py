@@ -210,7 +210,8 @@ def detect_arrival_timestamps(analysis: Analysis) -> Findings:
         yield make_warning(
             "source_timestamps_are_arrival_times",
             "Position timestamps are arrival times in the whole flight. The source was never "
-            "synchronised with the autopilot (TIMESYNC), so positions are late by their latency.",
+            "synchronised with the autopilot (TIMESYNC), so position timestamps are late by the "
+            "latency.",
             ANSWER_TIMESYNC_ACTION,
             {"until_s": float(position_age_s.index[-1])},
         )

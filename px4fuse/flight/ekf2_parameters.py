@@ -236,7 +236,7 @@ def check_parameters(changes: Mapping[str, float]) -> dict[str, float]:
                 name, MODEL_PARAMETERS, cutoff=MIN_SIMILARITY_OF_MISTYPED_PARAMETER
             )
             raise SettingsError(
-                f"The EKF2 replay does not contain {name}, so a change cannot be replayed",
+                f"The EKF2 replay does not contain the parameter {name}",
                 f"{suggestion}Choose from {', '.join(MODEL_PARAMETERS)}.",
             )
         if fault := parameter.describe_range_error(name, value):

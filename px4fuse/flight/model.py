@@ -112,7 +112,7 @@ def find_source_origin(kind: str, route: str) -> SourceOrigin:
     for origin in SOURCE_ORIGINS:
         if (origin.kind, origin.route) == (kind, route):
             return origin
-    raise ValueError(f"no position source of kind {kind!r} is available {route!r}")
+    raise ValueError(f"no position source of kind {kind!r} has the route {route!r}")
 
 
 REPEATED_TIMESTAMPS_NOTE = (
@@ -511,6 +511,10 @@ BIAS_NOT_LOGGED = Unavailable(
     "EKF2 accelerometer bias",
     "estimator_sensor_bias and estimator_states are not logged",
     "Record a ULog with SDLOG_PROFILE bit 0 (default).",
+)
+FASTER_LOGGING_ACTION = "Use a faster SD card, or log fewer topics (SDLOG_PROFILE)."
+FULL_IMU_RATE_ACTION = (
+    "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate."
 )
 HORIZON_NOT_LOGGED = Unavailable(
     "time of the fusion horizon",

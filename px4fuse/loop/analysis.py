@@ -262,7 +262,7 @@ def _compute_heading_error(
             quantity,
             f"the heading changes by {heading_change_deg:+.0f}°, and the true heading change is "
             "unknown",
-            "Give the true heading change: px4fuse loop --landed-at FORWARD,RIGHT,DEG.",
+            "Give the true heading change in flight: px4fuse loop --landed-at FORWARD,RIGHT,DEG.",
         )
     return float(np.degrees(lie.wrap(np.radians(heading_change_deg - true_end.heading_change_deg))))
 

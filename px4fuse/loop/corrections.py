@@ -85,7 +85,7 @@ def compute_odometry_variances(
         f"{noise.heading_deg:g}° in heading (1 σ, {drift_origin_text})"
     ]
     used_variance_text = (
-        "the {0} variance of odometry edges is the increase of the logged {0} variance"
+        "the {0} variance of an odometry edge is the increase of the logged {0} variance along it"
     )
     position_variance_increments_m2 = _compute_variance_increments(
         path.position_variance_m2, node_indices
@@ -98,7 +98,7 @@ def compute_odometry_variances(
         variance_texts.append(used_variance_text.format("position"))
     elif path.position_variance_m2 is not None:
         variance_texts.append(
-            "the logged position variances are not used, because they do not increase"
+            "the logged position variances are not used: they do not increase along the path"
         )
     rotation_variance_increments_rad2 = _compute_variance_increments(
         path.rotation_variance_rad2, node_indices
@@ -233,8 +233,8 @@ def build_pose_graph(
 # Labels of the corrected paths, by their key in results.json
 CORRECTION_LABELS: Mapping[CorrectionName, str] = {
     "uncorrected": "uncorrected path",
-    "by_distance_plain": "positions corrected in proportion to distance",
-    "by_distance": "positions and headings corrected in proportion to distance",
+    "by_distance_plain": "positions corrected in proportion to path length",
+    "by_distance": "positions and headings corrected in proportion to path length",
     "pose_graph_gated": "pose graph with accepted loop closures",
     "pose_graph_gnc": ROBUST_SOLUTION_LABEL,
 }
@@ -257,7 +257,7 @@ def distribute_closure_error_by_distance(
     for closure in closures:
         if closure.source == LANDING_CLOSURE_SOURCE and not closure.accepted:
             closure_error_vector_m = _explain_gate_rejection(
-                "path correction in proportion to distance flown", closure
+                "path correction in proportion to path length", closure
             )
     if isinstance(closure_error_vector_m, Unavailable):
         return {"by_distance_plain": closure_error_vector_m, "by_distance": closure_error_vector_m}

@@ -237,7 +237,7 @@ def read_trajectory_source(
     if track_name not in (None, *TRACK_NAMES):
         raise TrajectoryError(
             f"{display_name(path)}: a flight log contains no trajectory {track_name!r}",
-            f"Use one of {', '.join(TRACK_NAMES)}.",
+            f"Choose a trajectory: {', '.join(TRACK_NAMES)}.",
         )
     chosen_track_name = track_name or default_track
     if chosen_track_name is None:

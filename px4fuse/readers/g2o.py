@@ -141,7 +141,7 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
         vertices.raise_where(
             ~np.isin(np.arange(len(vertex_ids)), first_rows),
             "another line defines the vertex with this id",
-            "Keep only one of the lines with this id.",
+            "Keep only one line for each vertex id.",
         )
         poses = poses[first_rows]
     else:
@@ -255,13 +255,13 @@ def _make_information_matrices(edges: _TaggedLines, numbers: Array, dimension: i
     edges.raise_where(
         is_too_small | (magnitudes > _MAX_INFORMATION_ELEMENT),
         "an element of the information matrix is too large or too close to 0",
-        f"Each matrix element must be 0, or have a magnitude of {_MIN_INFORMATION_ELEMENT:g} to "
-        f"{_MAX_INFORMATION_ELEMENT:g}.",
+        "Each element of an information matrix must be 0, or have a magnitude of "
+        f"{_MIN_INFORMATION_ELEMENT:g} to {_MAX_INFORMATION_ELEMENT:g}.",
     )
     eigenvalues = np.linalg.eigvalsh(matrices)
     edges.raise_where(
         eigenvalues[:, 0] < -_EIGENVALUE_TOLERANCE * np.maximum(eigenvalues[:, -1], 0.0),
         "the information matrix has a negative eigenvalue",
-        "Write the upper triangle of the inverse covariance matrix, row by row.",
+        "Write the upper triangle of the edge's inverse covariance matrix, row by row.",
     )
     return matrices

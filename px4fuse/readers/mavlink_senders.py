@@ -279,7 +279,7 @@ def map_clock_to_boot(
         - compute_difference_from_receipt_s(timesync_fit)
         < MIN_CLOCK_DIFFERENCE_REDUCTION_BY_TIMESYNC_S
     ):
-        note = "the timestamps of the sender are boot times of the autopilot"
+        note = "the timestamps of the sender are times since the autopilot's boot"
         candidates.append((name, "boot clock", identity, note))
     if timesync_fit is not None:
         candidates.append((clock_name, "TIMESYNC", timesync_fit, ""))

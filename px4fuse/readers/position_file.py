@@ -299,8 +299,8 @@ def _check_options(
     names = columns or ("1", "2", "3")
     if "" in names or not 3 <= len({*names}) == len(names) <= 5:
         raise SettingsError(
-            f"{COLUMNS_OPTION}[,SIGMA]: {','.join(names)!r} must name three (without height), "
-            "four or five different columns."
+            f"{COLUMNS_OPTION}[,SIGMA]: {','.join(names)!r} does not name three to five different "
+            "columns."
         )
 
 

@@ -369,8 +369,8 @@ def _reconstruct_track(
         ("vehicle_local_position", *ekf2.innovation_topics),
         is_odometry=is_odometry,
         clock=(
-            f"autopilot boot clock: fusion time plus {EV_POS.delay}. The timestamps are late by up "
-            "to one sample interval"
+            f"autopilot boot clock: position timestamps are fusion times plus {EV_POS.delay}, late "
+            "by up to one sample interval"
         ),
     )
 

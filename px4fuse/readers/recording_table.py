@@ -440,5 +440,5 @@ def _read_kitti_table(path: Path, text: str) -> PositionTable:
         ["time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"],
         pd.DataFrame(poses).to_csv(index=False, header=False),
         frames=("edn",),
-        notes=(f"the times are from {display_name(times_path)}",),
+        notes=(f"the pose times are from {display_name(times_path)}",),
     )

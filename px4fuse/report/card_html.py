@@ -14,7 +14,6 @@ from px4fuse.card.model import (
 from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import format_ratio
-from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
 from px4fuse.finding import format_spans
 from px4fuse.html.safe import load_template, read_asset
@@ -38,13 +37,8 @@ SIGMA_RATIO_AXIS = {
 
 def make_diagnosis_card(analysis: Analysis) -> DiagnosisCard:
     """Return the diagnosis card: faults, causes and actions of an analysis."""
-    if analysis.request is None:
-        raise SettingsError(
-            "The diagnosis summary cannot be made: the analysis contains no settings.",
-            "Create the analysis with px4fuse.compare.",
-        )
-    card = build_card(analysis, analysis.request)
-    return card_text.with_typed_path(card, analysis.request.log)
+    request = analysis.require_request()
+    return card_text.with_typed_path(build_card(analysis, request), request.log)
 
 
 def make_card_html(

@@ -292,28 +292,26 @@ def _format_cause_lines(cause: DiagnosedCause, do_this: str) -> Iterator[Paragra
     times_text = " (all times: spans_s in the JSON results)" * is_shortened
     yield _make_labelled_paragraph("when", format_spans(cause.spans_s) + times_text)
     actions = [
-        (prefix, action)
-        for prefix, action in label_alternatives(cause)
-        if prefix or action.commands or action.sentence[1:] not in do_this
+        (label, action)
+        for label, action in label_alternatives(cause)
+        if ": " in label or action.commands or action.sentence[1:] not in do_this
     ]
-    labels = [f"{prefix}{action.target}" for prefix, action in actions]
-    label_width = max(map(len, labels), default=0) + 2
-    for label, (_, action) in zip(labels, actions, strict=True):
+    label_width = max((len(label) for label, _ in actions), default=0) + 2
+    for label, action in actions:
         yield from _format_action_lines(label, label_width, action)
     yield from _format_rerun_lines(cause.reruns)
     yield Paragraph(cause.after, "  ", "  ")
 
 
 def label_alternatives(cause: DiagnosedCause) -> list[tuple[str, Action]]:
-    """Return the actions of a cause, with "option 1: " or "in addition: " if there are options."""
+    """Return the actions of a cause, with labels such as "KF" or "option 1: KF"."""
     alternatives = [
-        (f"option {place}: ", action)
+        (f"option {place}: {action.target_name}", action)
         for place, alternative in enumerate(cause.alternatives, start=1)
         for action in alternative
     ]
-    return alternatives + [
-        ("in addition: " if alternatives else "", action) for action in cause.actions
-    ]
+    prefix = "in addition: " if alternatives else ""
+    return alternatives + [(f"{prefix}{action.target_name}", action) for action in cause.actions]
 
 
 def _format_action_lines(label: str, label_width: int, action: Action) -> Iterator[Paragraph]:

@@ -79,6 +79,7 @@ def make_time_offset_advice(
         }
     offset_s, (low_offset_s, high_offset_s) = time_offset.offset_s, time_offset.interval_s
     offset_text = f"{offset_s:+.3f} s (95 % {low_offset_s:+.3f} to {high_offset_s:+.3f} s)"
+    estimate_sentence = f"The estimated time offset is {offset_text}."
     if rerun is not None and truth_refutes_offset(rerun):
         return {
             "Result": (
@@ -87,12 +88,12 @@ def make_time_offset_advice(
                 f"{format_metres(rerun.before.position_rmse_m or 0.0)} to "
                 f"{format_metres(rerun.after.position_rmse_m or 0.0)} m."
             ),
-            "Offset": f"The estimated time offset is {offset_text}.",
+            "Offset": estimate_sentence,
             "Action": "Check the timestamps of the ground truth, not of the positions.",
         }
     advice_by_label = {
         "Result": "The position source has no significant time offset.",
-        "Offset": f"The estimated time offset is {offset_text}.",
+        "Offset": estimate_sentence,
     }
     if time_offset.is_significant(offset_s):
         late_or_early = "late" if offset_s < 0.0 else "early"

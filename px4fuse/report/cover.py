@@ -161,8 +161,7 @@ def _make_cause_fields(cause: DiagnosedCause) -> dict[str, Any]:
     formatted_fields = {
         "when": f"{cause.severity} · {format_spans(cause.spans_s) or 'whole flight'}",
         "actions": [
-            structs.asdict(action) | {"label": f"{prefix}{action.target}"}
-            for prefix, action in label_alternatives(cause)
+            structs.asdict(action) | {"label": label} for label, action in label_alternatives(cause)
         ],
         "reruns": make_rerun_rows(cause.reruns),
         "after": " ".join(filter(None, (format_rerun_note(cause.reruns), cause.after))),

@@ -45,14 +45,14 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     left_column, right_column = make_columns()
     _draw_contributions(
         left_column,
-        "Position difference: contribution of each setting",
+        "Contributions to the position difference KF - EKF2",
         {step.name: step.position_mean_square_m2 for step in explanation.steps},
         explanation.unexplained_mean_square_m2,
         explanation.position_mean_square_m2,
     )
     _draw_contributions(
         right_column,
-        "Velocity difference: contribution of each setting",
+        "Contributions to the velocity difference KF - EKF2",
         {step.name: step.velocity_mean_square_m2_s2 for step in explanation.steps},
         explanation.unexplained_velocity_mean_square_m2_s2,
         explanation.velocity_mean_square_m2_s2,
@@ -70,7 +70,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
         draw_curve(axes, difference_m.loc[start:end], **TRACK_STYLES["KF"])
         draw_curve(axes, unexplained_difference_m.loc[start:end], color=EKF2_COLOUR, lw=0.8)
     assert not isinstance(model, Unavailable)
-    page.write_muted_text(f"EKF2 replay: {format_replay_agreement(model.agreement)}.")
+    page.write_muted_text(f"{format_replay_agreement(model.agreement)}.")
     yield page
 
 
@@ -87,7 +87,8 @@ def describe_missing_explanation(analysis: Analysis) -> str:
 
 def format_replay_agreement(agreement: ReplayAgreement) -> str:
     sentences = [
-        f"{'agrees' if agreement.good else 'does not agree'} with the log ({agreement.reason})",
+        f"The replay {'agrees' if agreement.good else 'does not agree'} with the log "
+        f"({agreement.reason})",
         *(
             f"The replay of {AIDS[name].label} does not agree with the log and is not used: "
             f"{reason}"

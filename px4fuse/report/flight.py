@@ -52,8 +52,11 @@ def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
 def _draw_enlarged_sigma_plot(page: Page, result: AxisComparison) -> None:
     """Draw σ of position over a few updates."""
     start_s, end_s = find_zoom_span(result)
-    title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
-    axes = page.add_panel(title, ENLARGED_PLOT_HEIGHT, caption=_describe_sigma_at_updates(result))
+    axes = page.add_panel(
+        "σ of position (m) at a few updates",
+        ENLARGED_PLOT_HEIGHT,
+        caption=_describe_sigma_at_updates(result),
+    )
     kf_run, ekf2 = result.kf_run, result.ekf2_tracks
     kf_variances_m2 = pd.concat(
         [kf_run.updates["prior_position_variance_m2"], kf_run.steps["position_variance_m2"]]
@@ -85,7 +88,7 @@ def _describe_sigma_at_updates(result: AxisComparison) -> str:
     sentences = [
         "The line is σ of KF, which grows in each prediction (SIGMA_A "
         f"{result.kf_run.settings.sigma_a_m_s2:g} m/s²).",
-        "EKF2: ▵ before and ▿ after an update, □ logged σ.",
+        "σ of EKF2: ▵ before and ▿ after an update, □ logged.",
     ]
     for name, filter_summary in get_statistics_by_filter(result).items():
         sigma_before_update_m = filter_summary.sigma_p_before_update_m

@@ -222,7 +222,7 @@ def _describe_closure_error(loop: Loop) -> str:
         if loop.is_assessed:
             return f"Loop closure error hidden in student assignments; path length {length_m:.1f} m"
         reason = f": {loop.true_end.reason}" if isinstance(loop.true_end, Unavailable) else ""
-        return f"No loop closure error{reason}; path length {length_m:.1f} m"
+        return f"Loop closure error unknown{reason}; path length {length_m:.1f} m"
     heading_text = (
         f"heading error unknown: {heading_error_deg.reason}"
         if isinstance(heading_error_deg, Unavailable)

@@ -152,7 +152,7 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
         "frame": f"{alignment.frame} ({alignment.frame_reason})",
         "yaw": f"{yaw_text} ({alignment.yaw_reason})",
         "origin": "north {:.3f} m, east {:.3f} m, down {:.3f} m".format(*alignment.origin_m),
-        "clock": f"{clock_text} relative to the boot clock ({alignment.clock_reason})",
+        "clock": f"offset {clock_text} from the boot clock ({alignment.clock_reason})",
     }
     if alignment.correlation is not None:
         text_by_label["match"] = (

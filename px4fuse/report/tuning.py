@@ -81,8 +81,8 @@ def list_tuning_advice(
     if sigma_z.value is None and sigma_z.low is not None:
         yield (
             "SIGMA_Z",
-            f"The estimate of SIGMA_Z is at least {sigma_z.low:.2g} m. Possibly the source does "
-            "not measure the position along this axis.",
+            f"SIGMA_Z has only a lower bound, {sigma_z.low:.2g} m. Possibly the source does not "
+            f"measure the position ({axis_name}).",
         )
     elif sigma_z.value is None:
         bound_text = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
@@ -99,8 +99,8 @@ def list_tuning_advice(
             "SIGMA_A",
             "SIGMA_A cannot be estimated: the flight has too little motion, or is too short."
             if sigma_a.low is None
-            else f"The estimate of SIGMA_A is at least {sigma_a.low:.2g} m/s²: logged acceleration "
-            "and positions disagree.",
+            else f"SIGMA_A has only a lower bound, {sigma_a.low:.2g} m/s²: logged acceleration and "
+            "positions disagree.",
         )
     elif tuning.biases_fitted:
         yield (

@@ -350,7 +350,7 @@ def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
         unknown_fields.add("mistakes")
     if unknown_fields:
         raise ValueError(
-            f"the field {min(unknown_fields)} is unknown; known fields: "
+            f"the answer form has no field {min(unknown_fields)}; known fields: "
             f"mistake, {', '.join(quantity_fields)}"
         )
     # Without answers about figures, "choices" is an empty tuple, not a tuple of blank choices

@@ -401,7 +401,7 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     except TrajectoryError:
         if has_common_vertical:
             return "yaw", (
-                f"{yaw_text}motion along a line does not determine all angles, but z is vertical "
+                f"{yaw_text}motion along a line does not determine the rotation, but z is vertical "
                 f"in both frames ({frames_text})."
             )
     tracks_without_vertical = [

@@ -308,8 +308,8 @@ def estimate_rmse_interval(
     if error_count < MIN_BOOTSTRAP_BLOCKS * block_length:
         return Unavailable(
             f"95 % interval of the {analysis_name} RMSE",
-            f"the errors are correlated over {block_length} of {error_count} samples: fewer than "
-            f"{MIN_BOOTSTRAP_BLOCKS:.0f} independent blocks",
+            f"{error_count} errors, correlated over {block_length} errors, give fewer than "
+            f"{MIN_BOOTSTRAP_BLOCKS:.0f} independent blocks for the bootstrap",
             "Use a longer flight.",
         )
     circular_errors = np.append(squared_errors, squared_errors[: block_length - 1])

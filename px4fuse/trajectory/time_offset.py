@@ -130,8 +130,8 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
     )
     if not accepted_fits:
         return _make_unknown_offset(
-            "at every time offset at which the speeds correlate, the positions do not match or too "
-            "few poses overlap"
+            "at the time offsets with correlated speeds of both trajectories, the positions do not "
+            "match or too few poses overlap"
         )
     best_fit = accepted_fits[0]
     max_misfit = MIN_SECOND_BEST_RESIDUAL_RATIO * best_fit.compute_misfit()
@@ -167,7 +167,8 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
         offset_s=best_fit.offset_s,
         interval_s=(best_fit.offset_s - half_width_s, best_fit.offset_s + half_width_s),
         is_determinable=True,
-        reason="The time offset is estimated from correlated speeds, and minimises the ATE "
+        reason="The time offset is estimated from the speeds of both trajectories, and "
+        "minimises the ATE "
         f"({best_fit.compute_residual_rms_m():.3g} m, {len(best_fit.time_s)} poses).",
     )
 

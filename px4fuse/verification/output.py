@@ -49,6 +49,6 @@ def verification_page(name: str, verification: Verification, output: Path | None
     if output is not None and not verification.redrawn_pdf:
         page.write("The output file (-o) was not written: the analysis could not be repeated.")
     elif output is None and verification.pages:
-        page.write("Action: write the recomputed report with -o FILE.pdf, and read this report.")
+        page.write("Action: write the recomputed report with -o FILE.pdf, and read FILE.pdf.")
     page.write_muted_text(VERIFICATION_SCOPE_NOTE)
     return page

@@ -212,8 +212,8 @@ class _PdfComparison:
             elif isinstance(redrawn_value, ArrayObject):
                 if len(submitted_value) != len(redrawn_value):
                     yield (
-                        f"the PDF array {key} has {len(submitted_value)} elements, not "
-                        f"{len(redrawn_value)}",
+                        f"the PDF array {key} has {len(submitted_value)} elements; px4fuse "
+                        f"wrote {len(redrawn_value)}",
                         _STRUCTURAL,
                     )
                     continue

@@ -167,7 +167,8 @@ def _repeat_comparison(
     recorded_request = submitted_results.request
     if recorded_request.dt_s < MIN_REPEATABLE_DT_S:
         raise NotRepeatableError(
-            f"DT is below {MIN_REPEATABLE_DT_S:g} s, so the analysis would take too long"
+            f"the KF prediction interval DT is below {MIN_REPEATABLE_DT_S:g} s, so the analysis "
+            "would take too long"
         )
     hash_by_role = {file.role: file.sha256 for file in submitted_results.log.joined}
     request = replace(

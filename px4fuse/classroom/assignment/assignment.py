@@ -201,6 +201,6 @@ def _require_answer_key_of_same_flights(key_file: Path, has_same_flights: bool) 
     if not has_same_flights:
         raise OutputError(
             f"{key_file} is the answer key of other flights and was not overwritten. Choose "
-            "another file with --answer. To add students to the key, repeat its secret, options "
-            "and students."
+            "another file with --answer. To add students to the key, give the secret and options "
+            "of its command, and all students."
         )

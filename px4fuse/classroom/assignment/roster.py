@@ -111,8 +111,9 @@ def read_csv_sheet(path: Path) -> Sheet:
     except UnicodeDecodeError:  # spreadsheet programs on Windows write Windows-1252
         encoding = "cp1252"
         text = content.decode(encoding, errors="replace")
+    csv_remedy = "Give a CSV file with a header."
     if "\0" in text:
-        raise SettingsError(f"{path} is not a text file.", "Give a CSV file with a header.")
+        raise SettingsError(f"{path} is not a text file.", csv_remedy)
     header = next((line for line in text.splitlines() if line.strip()), "")
     # do not count separators in quoted column titles
     separator = max(COLUMN_SEPARATORS, key=re.sub(r'"[^"]*"', "", header).count)
@@ -122,7 +123,7 @@ def read_csv_sheet(path: Path) -> Sheet:
         raise SettingsError(f"{path} is not a CSV file ({error}).") from error
     column_titles, *rows = [cells for cells in lines if any(map(str.strip, cells))] or [[]]
     if not column_titles:
-        raise SettingsError(f"{path} is empty.", "Give a CSV file with a header.")
+        raise SettingsError(f"{path} is empty.", csv_remedy)
     padded_rows = (tuple(cells + [""] * (len(column_titles) - len(cells))) for cells in rows)
     return Sheet(path, tuple(column_titles), tuple(padded_rows), encoding, separator)
 

@@ -177,7 +177,7 @@ def _make_grade_details(grade: Grade) -> Iterator[RowDetailsSection]:
     )
     yield frame.make_list_section("Verification", verification.reasons)
     yield frame.make_table_section(
-        "Numbers that differ in the new run", differences, ("Value", "Report", "New run")
+        "Numbers that differ from the report", differences, ("Value", "Report", "Recomputed")
     )
     title = "Points (proposed)" if report.instructor_action else "Points"
     yield frame.make_table_section(title, items, ("Item", "Points", "Of", "Comment"), (1, 2))

@@ -359,8 +359,8 @@ def _choose_counted_report(candidates: Sequence[_CandidateReport], course: Cours
         forms = [each.report.form for each in eligible_candidates if each.time_s == chosen.time_s]
         if len(set(forms)) > 1:
             action = (
-                f"The answer forms of {len(forms)} reports differ. Ask the student which report "
-                "counts."
+                f"The student handed in {len(forms)} reports with different answer forms. Ask the "
+                "student which report counts."
             )
             report = replace(report, instructor_action=action)
     others = [each for each in candidates if each is not chosen]
@@ -511,7 +511,9 @@ def match_overrides(
             title = title_by_normalised_title.get(normalise_text(item_title), item_title)
             max_points, problem = max_points_by_title.get(title), ""
             if max_points is None:
-                problem = f"student {student_text} has no item {shorten_to_line(item_title, 60)!r}"
+                problem = (
+                    f"student {student_text} has no rubric item {shorten_to_line(item_title, 60)!r}"
+                )
             elif title in override_by_item_title:
                 problem = f"student {student_text} has two rows for {title or 'the whole report'!r}"
             elif (override.points or 0.0) > max_points:

@@ -186,7 +186,7 @@ def describe_right_answer(fault: InjectedFault) -> str:
     texts = []
     if fault.low is not None and fault.high is not None:
         unit = FAULT_KINDS[fault.kind].standard_unit
-        texts.append(f"accepted fault size {fault.low:.3g} to {fault.high:.3g} {unit}".rstrip())
+        texts.append(f"right fault size {fault.low:.3g} to {fault.high:.3g} {unit}".rstrip())
     start_text = "" if fault.from_s is None else f"from {fault.from_s:.0f} s "
     end_text = "" if fault.until_s is None else f"until {fault.until_s:.0f} s"
     texts.append(f"{start_text}{end_text}".strip() or "whole flight")

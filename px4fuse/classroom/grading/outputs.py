@@ -359,7 +359,7 @@ def _describe_verification(verification: Verification) -> str:
             "The numbers in your report differ from those that px4fuse computes from the same log"
         )
     elif verification.status == "other log":
-        statement += ", because its log is missing"
+        statement = "The log of your report is missing"
     reasons = (shorten_text(text).rstrip(".") for text in verification.reasons[:MAX_LISTED_REASONS])
     advice = "Make a new report of the log that you were given, and hand in the unchanged PDF."
     if verification.missing:

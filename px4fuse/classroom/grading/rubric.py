@@ -108,7 +108,7 @@ class Rubric(Record, kw_only=True):
         for title, unique_title in zip(titles, make_unique(titles), strict=True):
             if title != unique_title:
                 raise ValueError(
-                    f"the title {title!r} is not unique or is reserved. Give the item another title"
+                    f"the item title {title!r} is not unique or is reserved. Choose another title"
                 )
 
 
@@ -258,7 +258,7 @@ def _find_problems(
 def _make_other_students_log_advice(scoring_input: ScoringInput) -> str:
     """Return the action of the instructor for a report on the log of another student."""
     student_id = shorten_text(scoring_input.results.student.id)
-    id_text = f"the id in the report is {student_id}" if student_id else "the report has no id"
+    id_text = f"the report states the id {student_id}" if student_id else "the report states no id"
     if scoring_input.right_answers is None:
         return (
             "The log of the report is not in the answer key. Ask for a report on the assigned log."
