@@ -300,6 +300,7 @@ def _apply_alignment(
         yaw_sigma_deg = float(np.degrees(match.fit.yaw_sigma_rad or 0.0))
         if reference_name == EKF2_REFERENCE:  # the IMU does not determine the origin
             origin_m = match.fit.origin_m
+    # clock_offset_s = boot clock minus clock of the file; lag_s = flight time of its first position
     time_offset_reason = "the offset was given with --clock-offset"
     if match and clock_offset_s is None:
         lag_s = match.time_offset_fit.lag_s

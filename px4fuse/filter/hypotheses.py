@@ -296,6 +296,7 @@ def _find_jumps(
         return is_skipped | _is_in_window(time_s, jump_time_s, OUTLIER_BURST_DURATION_S)
 
     for _ in range(MAX_JUMPS):
+        # 1. Times to test: an outlier whose predecessor is none starts a run of outliers
         outlier_run_starts_s = time_s[
             np.flatnonzero(is_skipped & ~np.append(False, is_skipped[:-1]))
         ]
@@ -306,7 +307,8 @@ def _find_jumps(
             *_find_significant_jump_times(design_matrix, fit, is_skipped, outlier_run_starts_s),
             *_find_significant_jump_times(design_matrix, fit, is_skipped, measurement_times_s)[:1],
         ]
-        # Several times are tested, so each has a smaller false alarm probability (Bonferroni)
+        # 2. Test of a jump at each time, with a smaller false alarm probability, because several
+        # times are tested (Bonferroni)
         max_false_alarm_p = MAX_JUMP_FALSE_ALARM_P / max(len(outlier_run_starts_s), 1)
         tested_jumps = [
             _test_jump(
@@ -317,6 +319,7 @@ def _find_jumps(
         significant_jumps = [jump for jump in tested_jumps if jump]
         if not significant_jumps:
             break
+        # 3. Exact time of the most significant jump, and corrected mask of outliers
         best_jump, is_skipped = _locate_jump(
             design_matrix, is_skipped, max(significant_jumps, key=lambda jump: jump.chi_square)
         )

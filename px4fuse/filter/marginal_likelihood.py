@@ -275,7 +275,8 @@ def fit_positions(
         for rows in (slice(axis, axis + 1) for axis in axes):
             measured_axis_m, increments = measured_m[rows], (dp[rows], dv[rows])
             weighted_increments = system.weight_increments(*increments)
-            # Its values are ordered by measurement, then by state
+            # Its values are ordered by measurement, then by state: state_count values for each
+            # measurement, so the segment edges below are multiplied by it
             whitened_explained_part = system.whiten_explained_part(
                 measured_axis_m, *weighted_increments
             )

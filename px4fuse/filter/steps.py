@@ -78,7 +78,8 @@ def make_prediction_steps(axis: Axis, settings: Settings) -> PredictionSteps:
     time_s = np.union1d(
         grid_s[time_to_measurement_s > MAX_DIFFERENCE_OF_EQUAL_TIMES_S], measurement_time_s
     )
-    # See the attributes of PredictionSteps
+    # Attributes of PredictionSteps. A step belongs to the interval of the next measurement at or
+    # after its end
     measurement_index = np.full(len(time_s), -1, dtype=np.intp)
     measurement_index[np.searchsorted(time_s, measurement_time_s)] = np.flatnonzero(is_usable)
     last_steps = np.flatnonzero(measurement_index >= 0)
