@@ -22,6 +22,7 @@ from .tracks import (
     IMU_REFERENCE,
     MIN_MOTION_M,
     MIN_OVERLAP_S,
+    AmbiguousMatchError,
     NoMatchError,
     SampledTrack,
     align_samples,
@@ -139,13 +140,11 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> TrackMatch | None:
         file matches neither EKF2's position nor the IMU.
     """
     is_missing_by_option = {
-        "clock_offset_s": problem.lag_s is None,
-        "frame": len(problem.frames) != 1,
-        "yaw_deg": problem.yaw_rad is None,
+        "`clock_offset_s`": problem.lag_s is None,
+        "`frame`": len(problem.frames) != 1,
+        "`yaw_deg`": problem.yaw_rad is None,
     }
-    missing_options = [
-        f"`{name}`" for name, is_missing in is_missing_by_option.items() if is_missing
-    ]
+    missing_options = [option for option, is_missing in is_missing_by_option.items() if is_missing]
     reasons = []
     for make_references in (make_ekf2_references, make_imu_references):
         try:
@@ -157,10 +156,9 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> TrackMatch | None:
             # accurate enough for such a check
             if not missing_options:
                 return None
-            # If the error has a remedy, the file matches this reference track, but one alignment
-            # parameter is ambiguous. The IMU determines the parameters less accurately than EKF2's
-            # position, so it is not tried
-            if error.remedy:
+            # The IMU determines the parameters less accurately than EKF2's position, so it cannot
+            # resolve an ambiguity
+            if isinstance(error, AmbiguousMatchError):
                 raise
             reasons.append(error.reason)
     raise NoMatchError("; ".join(dict.fromkeys(reasons)), f"Give {' and '.join(missing_options)}")
@@ -195,16 +193,19 @@ def _match_with_reference(
     The yaw is wrong if only the fit with an estimated yaw is acceptable, or much better.
     """
     yaw_rad = problem.yaw_rad
-    fits = [(_fit_file_in_frame(problem, reference, frame, yaw_rad), frame) for frame in frames]
-    fits.sort(key=lambda fit_and_frame: fit_and_frame[0].residual_rms_m)
+    fits = sorted(
+        ((_fit_file_in_frame(problem, reference, frame, yaw_rad), frame) for frame in frames),
+        key=lambda fit_and_frame: fit_and_frame[0].residual_rms_m,
+    )
     fit, best_frame = fits[0]
-    fit_with_estimated_yaw = fit
+    fit_with_estimated_yaw, is_given_yaw_wrong = fit, False
     if yaw_rad is not None:
         fit_with_estimated_yaw = _fit_file_in_frame(problem, reference, best_frame, None)
-    is_given_yaw_wrong = is_reliable_fit(fit_with_estimated_yaw, reference.name) and (
-        fit.concordance_correlation < MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference.name]
-        or needs_rotation(fit.horizontal_rms_m, fit_with_estimated_yaw, reference.name)
-    )
+        is_given_yaw_wrong = is_reliable_fit(fit_with_estimated_yaw, reference.name) and (
+            fit.concordance_correlation
+            < MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference.name]
+            or needs_rotation(fit.horizontal_rms_m, fit_with_estimated_yaw, reference.name)
+        )
     return TrackMatch(
         reference,
         best_frame,
@@ -236,11 +237,11 @@ def is_reliable_fit(fit: TrackFit, reference: str) -> bool:
 def _require_unique_match(match: TrackMatch) -> None:
     reference_name = match.reference.name
     fit = match.time_offset_fit
-    if fit.concordance_correlation < MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference_name]:
+    min_correlation = MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference_name]
+    if fit.concordance_correlation < min_correlation:
         raise NoMatchError(
             f"the position file does not match the {reference_name}: Lin's concordance correlation "
-            f"coefficient is {fit.concordance_correlation:.2f} (minimum "
-            f"{MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference_name]:g})"
+            f"coefficient is {fit.concordance_correlation:.2f} (minimum {min_correlation:g})"
         )
     ambiguity_text = ""
     if fit.second_to_best_residual_ratio < MIN_SECOND_BEST_RESIDUAL_RATIO:
@@ -253,17 +254,17 @@ def _require_unique_match(match: TrackMatch) -> None:
             f"the standard deviation of the time offset exceeds {MAX_TIME_OFFSET_SIGMA_S:g} s"
         )
     if ambiguity_text:
-        raise NoMatchError(
+        raise AmbiguousMatchError(
             f"the time offset between position file and {reference_name} cannot be estimated: "
             f"{ambiguity_text}",
             "Give `clock_offset_s`",
         )
     if len(match.rms_m_by_frame) > 1:
-        best_residual_m, second_best_residual_m = (
-            np.hypot(m, INTERPOLATION_ERROR_M) for m in [*match.rms_m_by_frame.values()][:2]
+        best_residual_m, second_best_residual_m, *_ = np.hypot(
+            [*match.rms_m_by_frame.values()], INTERPOLATION_ERROR_M
         )
         if second_best_residual_m < MIN_SECOND_TO_BEST_FRAME_RESIDUAL_RATIO * best_residual_m:
-            raise NoMatchError(
+            raise AmbiguousMatchError(
                 "the frame of the position file cannot be estimated: several frames have "
                 f"similar residuals against the {reference_name} ({match.residuals_text})",
                 f"Give `frame`{' or `yaw_deg` auto' if match.is_given_yaw_wrong else ''}",
@@ -277,11 +278,11 @@ def _refit_without_origin_resets(
 
     The first match gives the position of the file at each reset, which is needed to find these.
     """
-    ekf2, fit = flight.ekf2, match.time_offset_fit
+    ekf2, first_fit = flight.ekf2, match.time_offset_fit
     if match.reference.name == IMU_REFERENCE or isinstance(ekf2, Unavailable) or not ekf2.resets:
         return match
     aligned_samples = align_samples(
-        problem.samples, match.frame, fit.yaw_rad, fit.origin_m, fit.lag_s
+        problem.samples, match.frame, first_fit.yaw_rad, first_fit.origin_m, first_fit.lag_s
     )
     ekf2_track = make_continuous_ekf2_track(ekf2, aligned_samples)
     refit = partial(
@@ -290,8 +291,10 @@ def _refit_without_origin_resets(
         ekf2_track,
         is_lag_estimated=problem.lag_s is None,
     )
-    # Each fit to the new track starts at the lag of the previous fit to the track with resets
-    fit = fit_with_estimated_yaw = refit(match.fit_with_estimated_yaw, yaw_rad=None)
+    # Both fits of the match are repeated, each from its own lag. Without a yaw from the user, they
+    # are the same fit
+    fit_with_estimated_yaw = refit(match.fit_with_estimated_yaw, yaw_rad=None)
+    fit = fit_with_estimated_yaw
     if problem.yaw_rad is not None:
         fit = refit(match.fit, yaw_rad=problem.yaw_rad)
     return replace(

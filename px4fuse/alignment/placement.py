@@ -80,11 +80,11 @@ def _explain_mismatch(
         return None
     faults = []
     if METRES_PER_UNIT[convention.unit] != metres_per_unit:
-        stated_unit = next(
-            name for unit, name in UNIT_NAMES.items() if METRES_PER_UNIT[unit] == metres_per_unit
-        )
+        unit_names = {METRES_PER_UNIT[unit]: name for unit, name in UNIT_NAMES.items()}
         faults.append(
-            describe_wrong_unit(convention.unit, "the positions", stated_unit, is_file=True)
+            describe_wrong_unit(
+                convention.unit, "the positions", unit_names[metres_per_unit], is_file=True
+            )
         )
     stated_frame = problem.frames[0].upper() if len(problem.frames) == 1 else ""
     # convention.axes are the axes of the file, rounded to multiples of 90°. If the file's frame has
@@ -174,19 +174,7 @@ def align_position_file(
         raise MissingDataError(
             f"{name}: {error.reason}; {spans_text}", f"{error.remedy}."
         ) from None
-    if frame:
-        frame_reason = "the frame was given with --position-frame"
-    elif match and len(problem.frames) != 1:
-        is_nwu_possible = yaw_rad is None and match.frame == "enu"
-        frame_reason = (
-            f"{match.frame} is the tested frame with the smallest residual against the "
-            f"{match.reference.name} ({match.residuals_text})"
-            f"{'; nwu was not tested, because it is enu with another yaw' * is_nwu_possible}"
-        )
-    elif recording.format:
-        frame_reason = f"the format {recording.format} defines the frame"
-    else:
-        frame_reason = "the column names of the position file contain the axis directions"
+    frame_reason = _explain_frame(frame, recording, problem, match)
     if yaw_deg is None:
         yaw_reason = "without --position-yaw, px4fuse does not rotate the positions"
     elif match and yaw_rad is None:
@@ -197,6 +185,29 @@ def align_position_file(
         flight, recording, problem, match, frame_reason, yaw_reason, clock_offset_s
     )
     offset_method = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
+    return _add_track(
+        flight,
+        recording,
+        alignment,
+        aligned_samples,
+        aligned_samples.index[0] - start_s,
+        offset_method,
+    )
+
+
+def _add_track(
+    flight: Flight,
+    recording: PositionRecording,
+    alignment: Alignment,
+    aligned_samples: pd.DataFrame,
+    time_shift_s: float,
+    offset_method: str,
+) -> Flight:
+    """Add the aligned positions of a file to the flight, as its first position source.
+
+    ``time_shift_s`` is flight time minus time of the file.
+    """
+    name, log = recording.name, flight.log
     rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
     invalid_reasons, sample_count = recording.reason_by_invalid_row, len(recording.samples)
     # If most timestamps are repeated, the number of dropped rows is stated in clock_map
@@ -216,13 +227,10 @@ def align_position_file(
         log=name,
         alignment=alignment,
         clock_map=clock_map,
-        invalid_reasons=invalid_reasons.set_axis(
-            invalid_reasons.index + (aligned_samples.index[0] - start_s)
-        ),
+        invalid_reasons=invalid_reasons.set_axis(invalid_reasons.index + time_shift_s),
         quantisation_step_m=recording.quantisation_step_m,
     )
     notes = [f"{name}: {text}" for text in (*recording.format_detection_notes, *recording.notes)]
-    log = flight.log
     dropped_counts = dict(log.dropped)
     if recording.dropped_row_count and not clock_map:
         dropped_counts[name] = recording.dropped_row_count
@@ -249,6 +257,27 @@ def _check_options(
             raise SettingsError(f"`{name}` {value:g} is not a finite number.")
 
 
+def _explain_frame(
+    given_frame: str | None,
+    recording: PositionRecording,
+    problem: AlignmentProblem,
+    match: TrackMatch | None,
+) -> str:
+    if given_frame:
+        return "the frame was given with --position-frame"
+    if match and len(problem.frames) != 1:
+        reason = (
+            f"{match.frame} is the tested frame with the smallest residual against the "
+            f"{match.reference.name} ({match.residuals_text})"
+        )
+        if problem.yaw_rad is None and match.frame == "enu":
+            reason += "; nwu was not tested, because it is enu with another yaw"
+        return reason
+    if recording.format:
+        return f"the format {recording.format} defines the frame"
+    return "the column names of the position file contain the axis directions"
+
+
 def _apply_alignment(
     flight: Flight,
     recording: PositionRecording,
@@ -266,6 +295,7 @@ def _apply_alignment(
     boot_time_s, is_yaw_estimated = flight.log.boot_time_s, problem.yaw_rad is None
     frame = match.frame if match else problem.frames[0]
     reference_name = match.reference.name if match else ""
+    # Values of the user. Those that the user did not give are replaced by those of the match
     yaw_rad, lag_s, origin_m = problem.yaw_rad or 0.0, problem.lag_s or 0.0, np.zeros(3)
     yaw_sigma_deg = time_offset_sigma_s = reference_correlation = residual_rms_m = None
     if match and is_yaw_estimated:
@@ -273,6 +303,7 @@ def _apply_alignment(
         yaw_sigma_deg = float(np.degrees(match.fit.yaw_sigma_rad or 0.0))
         if reference_name == EKF2_REFERENCE:  # the IMU cannot determine the frame's origin
             origin_m = match.fit.origin_m
+    # clock_offset_s = boot clock minus clock of the file; lag_s = flight time of its first position
     time_offset_reason = "the offset was given with --clock-offset"
     if match and clock_offset_s is None:
         lag_s = match.time_offset_fit.lag_s
@@ -288,22 +319,23 @@ def _apply_alignment(
         )
     aligned_samples = align_samples(problem.samples, frame, yaw_rad, origin_m, lag_s)
     distance_to_ekf2_m = None
-    # A file was matched with the IMU only because it does not match EKF2's position: do not compare
-    # it with EKF2's position
+    # Compare the file with EKF2 also without a match, if the user gave all parameters. EKF2 did not
+    # match a file that was matched with the IMU
     if reference_name != IMU_REFERENCE and (
         ekf2_comparison := _compare_with_ekf2(flight, aligned_samples)
     ):
         reference_name = EKF2_REFERENCE
         distance_to_ekf2_m, reference_correlation = ekf2_comparison
         residual_rms_m = float(np.sqrt(np.mean(distance_to_ekf2_m**2) / 2.0))
-    frame_conflict, warnings = "", list[str]()
+    frame_conflicts, warnings = list[str](), list[str]()
     if match:
-        warnings += _find_warnings(match, is_yaw_estimated)
+        warnings += _find_match_warnings(match, is_yaw_estimated)
         if not is_yaw_estimated:
-            frame_conflict = _describe_frame_conflict(match, distance_to_ekf2_m, yaw_rad)
+            frame_conflicts += _find_frame_conflict(match, distance_to_ekf2_m, yaw_rad)
+    # A wrong frame makes the correlation low, and its message is more precise
     if (
         distance_to_ekf2_m is not None
-        and not (is_yaw_estimated or frame_conflict)
+        and not (is_yaw_estimated or frame_conflicts)
         and reference_correlation is not None
         and reference_correlation < MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[EKF2_REFERENCE]
     ):
@@ -333,7 +365,7 @@ def _apply_alignment(
         reference=reference_name,
         correlation=reference_correlation,
         residual_rms_m=residual_rms_m,
-        misplaced=(frame_conflict,) if frame_conflict else (),
+        misplaced=tuple(frame_conflicts),
         warnings=tuple(warnings),
     )
     return alignment, aligned_samples
@@ -363,36 +395,38 @@ def _compare_with_ekf2(
     return distance_to_ekf2_m, float(np.sum(file_position_m * ekf2_position_m) / norm_product)
 
 
-def _describe_frame_conflict(
+def _find_frame_conflict(
     match: TrackMatch, distance_to_ekf2_m: Array | None, yaw_rad: float
-) -> str:
-    """Describe a frame that is rotated against the reference; empty without such a rotation.
+) -> Iterator[str]:
+    """Describe a frame that is rotated against the reference; nothing without such a rotation.
 
     EKF2 shows rotation and origin of the frame, the IMU only the rotation.
     """
     reference_name, fit = match.reference.name, match.fit_with_estimated_yaw
     yaw_deg = np.degrees(np.angle(np.exp(1j * (fit.yaw_rad - yaw_rad))))
-    is_rotated, shift_text = match.is_given_yaw_wrong, ""
-    if distance_to_ekf2_m is not None:
-        # Residual per horizontal axis, like TrackFit.horizontal_rms_m
+    if distance_to_ekf2_m is None:
+        # No comparison with EKF2: the fits allow any origin, so they show the rotation only
+        has_conflict, shift_text = match.is_given_yaw_wrong, ""
+    else:
+        # The distances contain rotation and shift. Residual per horizontal axis, like
+        # TrackFit.horizontal_rms_m
         residual_m = compute_clipped_rms_m(distance_to_ekf2_m) / np.sqrt(2.0)
         shift_m = np.hypot(*fit.origin_m[:2])
-        is_rotated = (
+        has_conflict = (
             is_reliable_fit(fit, reference_name)
             and needs_rotation(residual_m, fit, reference_name)
             # GNSS determines EKF2's origin only to about 1 m
             and (abs(yaw_deg) >= MIN_REPORTED_YAW_DEG or shift_m >= MIN_REPORTED_SHIFT_M)
         )
         shift_text = f"The position file has its origin {shift_m:.1f} m from EKF2's origin. "
-    if not is_rotated:
-        return ""
-    return (
-        f"The frame of the position file is rotated by {yaw_deg:.1f}° relative to the "
-        f"{reference_name}. {shift_text}Give --position-yaw auto to estimate yaw and origin."
-    )
+    if has_conflict:
+        yield (
+            f"The frame of the position file is rotated by {yaw_deg:.1f}° relative to the "
+            f"{reference_name}. {shift_text}Give --position-yaw auto to estimate yaw and origin."
+        )
 
 
-def _find_warnings(match: TrackMatch, is_yaw_estimated: bool) -> Iterator[str]:
+def _find_match_warnings(match: TrackMatch, is_yaw_estimated: bool) -> Iterator[str]:
     reference_name = match.reference.name
     fit = match.time_offset_fit
     if fit.concordance_correlation < MIN_CONCORDANCE_CORRELATION_WITHOUT_WARNING[reference_name]:

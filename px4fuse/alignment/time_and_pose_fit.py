@@ -113,15 +113,19 @@ def find_correlation_peak(
     moments_by_lag = compute_moments(
         file_track.to_complex_m(), reference.to_complex_m(), file_track.is_valid, reference.is_valid
     )
+    # All arrays below have one value for each lag
     common_sample_counts, covariance = moments_by_lag.count, moments_by_lag.covariance
     square_sum_m2 = moments_by_lag.sum_of_squares_a + moments_by_lag.sum_of_squares_b
     has_overlap = common_sample_counts >= min_sample_count
     # If the vehicle is at rest in both tracks, the sum of squared positions (relative to their
     # mean) is only a rounding error
     has_overlap &= square_sum_m2 > 1e-9 * np.max(square_sum_m2)
+    # A rotation of the file by yaw multiplies the covariance by e^{-i·yaw}. The best yaw makes it
+    # real and positive
     rotated_covariance = (
         np.abs(covariance) if yaw_rad is None else (np.exp(-1j * yaw_rad) * covariance).real
     )
+    # Lin's coefficient c = 2·covariance / (variance of file + variance of reference)
     concordance_correlation = np.zeros_like(square_sum_m2)
     np.divide(
         2.0 * rotated_covariance, square_sum_m2, out=concordance_correlation, where=has_overlap
@@ -135,12 +139,15 @@ def find_correlation_peak(
         float(reference.time_s[0]) + (best_index - len(file_track.is_valid) + 1) * GRID_STEP_S,
         concordance_correlation[best_index],
     )
-    # The best peak ends where the concordance correlation falls below half of its maximum
+    # The best peak is the region around the best lag, at most MIN_PEAK_DISTANCE_S to each side, in
+    # which the concordance is at least half of its maximum. label() numbers such regions
     steps_from_best = np.arange(len(covariance)) - best_index
     region_numbers, _ = label(
         (np.abs(steps_from_best) <= round(MIN_PEAK_DISTANCE_S / GRID_STEP_S))
         & (concordance_correlation >= 0.5 * concordance_correlation[best_index])
     )
+    # A second peak is outside the best peak, has enough samples and motion, and is an acceptable
+    # match
     can_be_second_peak = (
         has_overlap
         & (region_numbers != region_numbers[best_index])
@@ -153,6 +160,7 @@ def find_correlation_peak(
     )
     if not can_be_second_peak.any():
         return peak
+    # Sum of squared residuals of two centred series: Σ|a|² + Σ|b|² - 2 Re Σ conj(a) b
     mean_square_residual_m2 = np.maximum(square_sum_m2 - 2.0 * rotated_covariance, 0.0) / (
         2.0 * np.maximum(common_sample_counts, 1.0)
     )
@@ -199,12 +207,15 @@ def fit_by_least_squares(
     reference_time_s = file_track.time_s[is_used] + peak.lag_s
     file_position_m = file_track.to_complex_m()[is_used]
     reference_position_m = reference_m[is_used, 0] + 1j * reference_m[is_used, 1]
+    # Initial values. With positions relative to their centre, the errors of yaw and origin are
+    # uncorrelated; below, the origin is converted back
     centre_m, reference_mean_m = file_position_m.mean(), reference_position_m.mean()
-    # With centred positions, the errors of yaw and origin are uncorrelated
     file_position_m = file_position_m - centre_m
     file_variance_m2, reference_variance_m2 = np.var(file_position_m), np.var(reference_position_m)
     sigma_product_m2 = np.sqrt(file_variance_m2 * reference_variance_m2)
     covariance_m2 = np.vdot(file_position_m, reference_position_m) / len(file_position_m)
+    # The coherence is the correlation as a complex number: its phase is the yaw, and its magnitude
+    # does not depend on scale. The concordance (below) also decreases with a difference in scale
     coherence = complex(covariance_m2 / sigma_product_m2) if sigma_product_m2 > 0.0 else 0j
     reference_horizontal_position_m = reference.to_complex_m()
 
@@ -240,16 +251,19 @@ def fit_by_least_squares(
     parameters[is_fitted] = solution.x
     parameter_sigma = np.full(4, np.nan)
     parameter_sigma[is_fitted] = _compute_parameter_sigma(np.asarray(solution.jac), residuals_m)
+    # Results: parameters with σ, concordance, origin of the file, and residuals
     origin_north_m, origin_east_m, lag_correction_s, fitted_yaw_rad = parameters.tolist()
     _, _, lag_sigma_s, yaw_sigma_rad = parameter_sigma.tolist()
     # At its limit, the lag is not determined by the data
     if abs(lag_correction_s) > 0.99 * MAX_LAG_CORRECTION_S:
         lag_sigma_s = np.inf
     concordance_correlation = peak.concordance_correlation
-    if np.isnan(concordance_correlation):  # the lag is given: there is no correlation peak
+    # If the lag is given, there is no correlation peak: compute the concordance at the fitted yaw
+    if np.isnan(concordance_correlation):
         rotated_covariance_m2 = (np.exp(-1j * fitted_yaw_rad) * covariance_m2).real
         mean_of_variances_m2 = max((file_variance_m2 + reference_variance_m2) / 2.0, 1e-300)
         concordance_correlation = rotated_covariance_m2 / mean_of_variances_m2
+    # Position of the file's origin, from that of the centre of its positions
     complex_origin_m = (
         complex(origin_north_m, origin_east_m) - np.exp(1j * fitted_yaw_rad) * centre_m
     )

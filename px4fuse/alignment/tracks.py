@@ -54,6 +54,10 @@ class NoMatchError(Px4FuseError):
     """Error: the position file does not match the flight."""
 
 
+class AmbiguousMatchError(NoMatchError):
+    """Error: the file matches the flight, but its time offset or its frame is ambiguous."""
+
+
 @dataclass(frozen=True)
 class SampledTrack:
     """Positions over time.
@@ -159,9 +163,10 @@ def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
     states = [state]
     resets = flight.ekf2.find_horizontal_resets()
     if resets:
+        # A reset moves all later positions. The matrix product sums the resets before each sample
         is_after_reset = state.index.to_numpy()[:, None] >= [reset.time_s for reset in resets]
         reset_sum_m = is_after_reset @ np.array([(*reset.delta[:2], 0.0) for reset in resets])
-        states.append(state.assign(**(state[Columns.POSITION] - reset_sum_m)))
+        states.append(state[Columns.POSITION] - reset_sum_m)
     references = [_smooth_ekf2_track(state) for state in states]
     if max(map(compute_horizontal_range_m, references)) < MIN_MOTION_M:
         raise NoMatchError(
@@ -176,14 +181,15 @@ def make_imu_references(flight: Flight) -> list[SampledTrack]:
     acceleration = compute_ned_acceleration(flight)
     if isinstance(acceleration, Unavailable):
         raise NoMatchError(f"the log has no acceleration in NED ({acceleration.reason})")
+    # Integrate to the velocity, filter it, integrate it to the position, and filter this too: each
+    # integral drifts
     time_s = acceleration.index.to_numpy()
     velocity_m_s = integrate_cumulatively(acceleration.to_numpy(), time_s)
-    # The field position_m of this track holds the velocity (m/s), to resample it to the grid
+    # To resample the velocity (m/s) to the grid, it is stored in a track as "position_m"
     velocity_track = resample_to_grid(_make_gapless_track(time_s, velocity_m_s))
     grid_s = velocity_track.time_s
     if len(grid_s) * GRID_STEP_S < MIN_OVERLAP_S:
         raise NoMatchError(f"the IMU data are shorter than {MIN_OVERLAP_S:g} s")
-    # Each integral drifts, so velocity and position are both filtered
     position_m = integrate_cumulatively(apply_band_pass(velocity_track.position_m), grid_s)
     imu_track = SampledTrack(
         grid_s, apply_band_pass(position_m), velocity_track.is_valid, IMU_REFERENCE

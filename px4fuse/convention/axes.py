@@ -280,6 +280,7 @@ def find_convention_candidates(
     source_is_valid, imu_is_valid = (
         motion.is_valid[:, None].astype(float) for motion in (source_motion, imu_motion)
     )
+    # The product of the masks is 1 if both samples are valid. Their sum counts these samples
     common_sample_counts = _compute_cross_moments(source_is_valid, imu_is_valid)
 
     has_overlap = common_sample_counts[:, 0, 0] * GRID_INTERVAL_S >= MIN_OVERLAP_S
@@ -310,28 +311,24 @@ def find_convention_candidates(
     score *= common_sample_counts[has_overlap] * (GRID_INTERVAL_S / SECOND_DIFFERENCE_WINDOW_S)
     nearest_quarter_turns = np.round(rotation_rad / (np.pi / 2.0)).astype(int) % 4
     hypotheses = []
-    for quarter_turns in range(4):
-        scores_at_quarter_turn = np.where(
-            (nearest_quarter_turns == quarter_turns)[..., None], score, -np.inf
+    for quarter_turns, (column, permutation), (unit_index, unit) in product(
+        range(4), enumerate(permutations), enumerate(METRES_PER_UNIT)
+    ):
+        # Keep the best time offset of each combination of axes (permutation and quarter turns) and
+        # unit. At each time offset, the best rotation determines the quarter turns
+        scores_at_quarter_turns = np.where(
+            nearest_quarter_turns[:, column] == quarter_turns, score[:, column, unit_index], -np.inf
         )
-        # Keep the best time offset of each axis permutation and unit
-        for (permutation_index, unit_index), offset_index in np.ndenumerate(
-            np.argmax(scores_at_quarter_turn, axis=0)
-        ):
-            unit_name = [*METRES_PER_UNIT][unit_index]
-            axis_permutation = permutations[permutation_index]
-            total_score = (
-                scores_at_quarter_turn[offset_index, permutation_index, unit_index]
-                + axis_permutation.compute_log_prior_odds(quarter_turns)
-                + UNIT_OTHER_THAN_METRES_LOG_PRIOR_ODDS * (unit_name != "m")
-            )
-            # The least-squares fit starts without heading drift, clock drift and accelerometer bias
-            parameters = np.array(
-                [delay_s[offset_index], rotation_rad[offset_index, permutation_index], *[0.0] * 5]
-            )
-            hypotheses.append(
-                Hypothesis(axis_permutation, unit_name, parameters, float(total_score))
-            )
+        offset_index = np.argmax(scores_at_quarter_turns)
+        total_score = (
+            scores_at_quarter_turns[offset_index]
+            + permutation.compute_log_prior_odds(quarter_turns)
+            + UNIT_OTHER_THAN_METRES_LOG_PRIOR_ODDS * (unit != "m")
+        )
+        # The least-squares fit starts without heading drift, clock drift and accelerometer bias
+        parameters = np.zeros_like(PARAMETER_PRIOR_PRECISION)
+        parameters[[DELAY, HEADING]] = delay_s[offset_index], rotation_rad[offset_index, column]
+        hypotheses.append(Hypothesis(permutation, unit, parameters, float(total_score)))
     hypotheses.sort(key=lambda hypothesis: -hypothesis.score)
     return [
         hypothesis
@@ -369,7 +366,8 @@ def _compute_log_likelihoods(
         np.transpose(permutations)
     )
     metres_per_unit = np.array([*METRES_PER_UNIT.values()])
-    # Complex numbers are north + i east. The phase of the correlation is the rotation
+    # Complex numbers: source axes first + i·handedness·second, IMU north + i·east. The correlation
+    # is the mean of conj(source)·IMU; its phase is the rotation with the smallest residuals
     horizontal_products = products[..., 0] + 1j * products[..., 1]
     correlation = (
         horizontal_products[:, first_horizontal_axis]
@@ -377,7 +375,8 @@ def _compute_log_likelihoods(
     )
     source_squares = np.maximum(source_squares, 1e-12)
 
-    # Mean squares of the residuals (source minus IMU), with the positions converted to metres
+    # Mean squares of source minus IMU, for the best rotation: u²·source² + IMU² - 2·u·correlation,
+    # with u metres per unit. The horizontal mean square is per axis
     horizontal_mean_square_residual_m2 = (
         metres_per_unit**2
         * (source_squares[:, first_horizontal_axis] + source_squares[:, second_horizontal_axis])
@@ -389,6 +388,8 @@ def _compute_log_likelihoods(
         + imu_squares_m2[..., 2:]
         - 2.0 * metres_per_unit * (vertical_sign * products[:, vertical_axis, 2])[..., None]
     )
+    # Log likelihood ratio of normal residuals: -½ ln σ² of the residuals for each axis, minus
+    # -½ ln σ² of the source axis itself (in metres: 3 axes, so 6 ln u in total)
     log_likelihood_per_residual = 0.5 * (
         np.log(source_squares).sum(axis=1, keepdims=True)
         + 6.0 * np.log(metres_per_unit)
@@ -411,9 +412,12 @@ def refine_hypothesis(
     parameters = initial_hypothesis.parameters
     previous_score = -np.inf
     for _ in range(MAX_REFINEMENT_ITERATIONS):
-        hypothesis, parameter_step = _evaluate_hypothesis(
+        evaluation = _evaluate_hypothesis(
             replace(initial_hypothesis, parameters=parameters), rows, source_motion, imu_motion
         )
+        if not evaluation:
+            break
+        hypothesis, parameter_step = evaluation
         if hypothesis.score > best_hypothesis.score:
             best_hypothesis = hypothesis
         if abs(hypothesis.score - previous_score) < MIN_SCORE_CHANGE:
@@ -431,9 +435,15 @@ def _evaluate_hypothesis(
     rows: IntArray,
     source_motion: SourceSecondDifferences,
     imu_motion: ImuSecondDifferences,
-) -> tuple[Hypothesis, Array]:
-    """Compute the score of a hypothesis, and the next Gauss-Newton step of its parameters."""
-    delay_s, rotation_rad, heading_drift_rad_s, clock_drift, *_ = hypothesis.parameters
+) -> tuple[Hypothesis, Array] | None:
+    """Compute the score of a hypothesis, and the next Gauss-Newton step of its parameters.
+
+    Return None if source and IMU have too few common samples, or no motion.
+    """
+    delay_s, rotation_rad, heading_drift_rad_s, clock_drift, *accelerometer_bias_m_s2 = (
+        hypothesis.parameters
+    )
+    # 1. Rows of the IMU at the times of the source, corrected for delay and clock drift
     time_s = source_motion.time_s[rows]
     row_interval_s = GRID_INTERVAL_S * np.median(np.diff(rows))
     mean_time_s = np.mean(time_s)
@@ -448,23 +458,23 @@ def _evaluate_hypothesis(
     independent_residual_count = (
         np.count_nonzero(is_used) * row_interval_s / SECOND_DIFFERENCE_WINDOW_S
     )
-    rejected_result = replace(hypothesis, score=-np.inf), np.zeros_like(PARAMETER_PRIOR_PRECISION)
     if independent_residual_count * SECOND_DIFFERENCE_WINDOW_S < MIN_OVERLAP_S:
-        return rejected_result
+        return None
     grid_index, time_s = grid_index[is_used], time_s[is_used]
     elapsed_s = time_s - time_s[0]
     grid_fraction = (fractional_grid_index[is_used] - grid_index)[:, None, None]
     imu_table_rows = (1.0 - grid_fraction) * imu_motion.table[
         grid_index
     ] + grid_fraction * imu_motion.table[grid_index + 1]
+    # 2. Residuals: second differences of the source, converted to NED and metres, minus those of
+    # the IMU
     unconverted_second_differences = source_motion.second_differences[rows[is_used]]
     axis_permutation = hypothesis.axis_permutation
     metres_per_unit = METRES_PER_UNIT[hypothesis.unit]
-    complex_rotation = metres_per_unit * np.exp(
-        1j * (rotation_rad + heading_drift_rad_s * elapsed_s)
-    )
-    complex_second_difference_m = complex_rotation * axis_permutation.combine_horizontal_axes(
-        unconverted_second_differences
+    complex_second_difference_m = (
+        metres_per_unit
+        * np.exp(1j * (rotation_rad + heading_drift_rad_s * elapsed_s))
+        * axis_permutation.combine_horizontal_axes(unconverted_second_differences)
     )
     source_second_difference_m = np.column_stack(
         [
@@ -476,16 +486,19 @@ def _evaluate_hypothesis(
         ]
     )
     imu_second_difference_m = (
-        imu_table_rows[..., 0] - imu_table_rows[..., 1:] @ hypothesis.parameters[4:]
+        imu_table_rows[..., 0] - imu_table_rows[..., 1:] @ accelerometer_bias_m_s2
     )
     residual = source_second_difference_m - imu_second_difference_m
+    # 3. Log likelihoods: horizontal and vertical residuals, then x, y and z of the source without
+    # the IMU, which is the model for positions that do not depend on the motion
     residual_squares = np.stack([np.sum(residual[:, :2] ** 2, axis=1), residual[:, 2] ** 2])
     log_likelihoods, variances = _fit_student_distributions(
         np.concatenate([residual_squares, unconverted_second_differences.T**2]),
         np.array([2, 1, 1, 1, 1]),
         np.array([MIN_HORIZONTAL_SIGMA_M, MIN_VERTICAL_SIGMA_M, 1e-6, 1e-6, 1e-6]) ** 2,
     )
-    # Omit a constant axis (for example without heights) from the likelihood
+    # Log likelihood ratio of both models. The density of the positions in metres becomes that in
+    # their unit by ln(metres per unit) for each axis. A constant axis (no heights) is omitted
     is_axis_known = unconverted_second_differences.any(axis=0)
     log_likelihood_gain = (
         log_likelihoods[0]
@@ -493,6 +506,8 @@ def _evaluate_hypothesis(
         + np.log(metres_per_unit) * np.count_nonzero(is_axis_known)
         - np.sum(log_likelihoods[2:], where=is_axis_known)
     )
+    # 4. Scale of the positions from the weighted squares and products of source and IMU. Weights of
+    # a Student distribution, reduced because successive rows are correlated
     weight = 1.0 / (variances[:2, None] + residual_squares / STUDENT_DEGREES_OF_FREEDOM)
     weight *= row_interval_s / SECOND_DIFFERENCE_WINDOW_S
     horizontal_m = np.stack([source_second_difference_m, imu_second_difference_m])[..., :2]
@@ -501,7 +516,8 @@ def _evaluate_hypothesis(
     ).tolist()
     # Without motion, axes and unit cannot be determined
     if 0.0 in (source_square_sum, source_imu_product_sum, imu_square_sum):
-        return rejected_result
+        return None
+    # 5. Gauss-Newton step from the derivatives of the residuals with respect to the parameters
     jacobian = np.zeros((len(grid_index), 3, len(PARAMETER_PRIOR_PRECISION)))
     jacobian[..., DELAY] = imu_motion.second_difference_derivative_m_s[grid_index]
     jacobian[:, 0, HEADING] = -complex_second_difference_m.imag
@@ -509,10 +525,11 @@ def _evaluate_hypothesis(
     jacobian[..., HEADING_DRIFT] = jacobian[..., HEADING] * elapsed_s[:, None]
     jacobian[..., CLOCK_DRIFT] = jacobian[..., DELAY] * (time_s - mean_time_s)[:, None]
     jacobian[..., 4:] = imu_table_rows[..., 1:]
-    uses_gyro_heading = hypothesis.heading_from != "EKF2"
-    is_parameter_estimated = np.array(
-        [True, hypothesis.has_rotation, uses_gyro_heading, hypothesis.has_clock_drift, *[True] * 3]
-    )
+    is_parameter_estimated = np.ones(len(PARAMETER_PRIOR_PRECISION), dtype=bool)
+    is_parameter_estimated[HEADING] = hypothesis.has_rotation
+    # Only the heading of the gyroscopes drifts
+    is_parameter_estimated[HEADING_DRIFT] = hypothesis.heading_from != "EKF2"
+    is_parameter_estimated[CLOCK_DRIFT] = hypothesis.has_clock_drift
     columns = jacobian[..., is_parameter_estimated].reshape(-1, is_parameter_estimated.sum())
     weighted_design_columns = columns.T * weight[[0, 0, 1]].T.ravel()
     normal_matrix = weighted_design_columns @ columns + np.diag(
@@ -556,13 +573,16 @@ def _fit_student_distributions(
         Dimensions (1 or 2) of the residual vectors.
     """
     medians = np.median(squared_residuals, axis=1)
-    # Medians of χ² with one and with two degrees of freedom: 0.455 and 1.386
+    # Initial variances from the medians of χ² with one and with two degrees of freedom: 0.455 and
+    # 1.386. Iteration: σ² = mean of weight · r² / d, with the weight (ν + d) / (ν + r² / σ²) of a
+    # residual with length r, d dimensions, and ν degrees of freedom
     variances = np.maximum(medians / np.where(dimensions == 1, 0.455, 1.386), min_variances)
     degrees_of_freedom = STUDENT_DEGREES_OF_FREEDOM + dimensions
     for _ in range(5):  # the variances change little in later iterations
         denominators = STUDENT_DEGREES_OF_FREEDOM + squared_residuals / variances[:, None]
         weighted_means = np.mean(squared_residuals / denominators, axis=1)
         variances = np.maximum(degrees_of_freedom * weighted_means / dimensions, min_variances)
+    # ln p = -½ (d ln σ² + (ν + d) ln(1 + r² / (ν σ²))) + constant
     normalised_squares = squared_residuals / variances[:, None] / STUDENT_DEGREES_OF_FREEDOM
     mean_log1p_squares = np.mean(np.log1p(normalised_squares), axis=1)
     return (

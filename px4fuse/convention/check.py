@@ -301,14 +301,11 @@ def _judge_hypothesis(
     """
     if hypothesis.score < MIN_LOG_LIKELIHOOD_GAIN:
         return "not determinable"
-    min_log_likelihood_gain_per_sample = (
-        MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE_IF_AMBIGUOUS
-        if is_ambiguous
-        else MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE
-    )
+    min_gain_per_sample = MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE
+    if is_ambiguous:
+        min_gain_per_sample = MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE_IF_AMBIGUOUS
     if (
-        hypothesis.score
-        < min_log_likelihood_gain_per_sample * hypothesis.independent_residual_count
+        hypothesis.score < min_gain_per_sample * hypothesis.independent_residual_count
         or hypothesis.min_source_to_imu_displacement_ratio > MAX_SOURCE_TO_IMU_DISPLACEMENT_RATIO
         or hypothesis.max_source_to_imu_displacement_ratio < MIN_SOURCE_TO_IMU_DISPLACEMENT_RATIO
         or compute_residual_ratio(hypothesis, positions) > MAX_RESIDUAL_TO_NOISE_RATIO
@@ -351,6 +348,8 @@ def _estimate_clock_drift(
 
     A large drift hides the motion: if no hypothesis fits, the best tested drift is removed first.
     """
+    # If no hypothesis fits, test a grid of drifts. It is searched for candidates only, because a
+    # refinement of each would take too long
     start_hypothesis, removed_drift = best_hypothesis, 0.0
     if (
         best_hypothesis.score < MIN_LOG_LIKELIHOOD_GAIN
@@ -367,21 +366,22 @@ def _estimate_clock_drift(
         best_candidate, removed_drift = max(candidates_and_drifts, key=lambda pair: pair[0].score)
         start_hypothesis = replace(best_candidate, heading_from=best_hypothesis.heading_from)
         positions = positions.remove_clock_drift(removed_drift)
+    # Estimate the drift that is left
     hypothesis = refine_hypothesis(
         replace(start_hypothesis, has_clock_drift=True),
         positions,
         positions.compute_second_differences(imu_motion),
         imu_motion,
     )
-    # If a clock drift was removed before the fit, no test is made here: determine_source_convention
-    # repeats the search of the convention without the drift
+    # Without a removed drift, the drift must increase the score. The score of a candidate is not
+    # refined, so a removed drift is not tested here, but by determine_source_convention
     if (
         not removed_drift
         and hypothesis.score <= start_hypothesis.score + MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT
     ):
         return 0.0
-    # Total rate of the clock: remove_clock_drift divides the times by 1 + removed_drift, and
-    # _evaluate_hypothesis multiplies them by 1 - remaining drift
+    # Clock rates are multiplied: 1 + removed drift, and 1 / (1 - drift that is left), because
+    # _evaluate_hypothesis multiplies times of the source by 1 - drift
     return (1.0 + removed_drift) / (1.0 - float(hypothesis.parameters[CLOCK_DRIFT])) - 1.0
 
 
@@ -409,8 +409,8 @@ def _check_orientation(
         or axis_permutation.is_mirrored
     ):
         return convention
-    # Integrate the IMU with the heading of the source's orientation. The heading of the positions
-    # relative to this motion is the heading error
+    # Heading error: integrate the IMU with the heading of the source's orientation. If the
+    # orientation is correct, the positions are not rotated relative to this motion
     source_heading_rad = np.interp(inertial_data.time_s, time_s, heading(attitude))
     imu_motion = integrate_imu_motion(
         inertial_data, replace_heading(inertial_data.gyro_attitude, source_heading_rad)
@@ -419,14 +419,17 @@ def _check_orientation(
         imu_motion.time_s < time_s[-1] - SECOND_DIFFERENCE_WINDOW_S
     )
     imu_motion = replace(imu_motion, is_valid=imu_motion.is_valid & is_covered)
-    # Expected heading (°) of the x axis of the positions if the heading of the source's orientation
-    # is correct: 0 in NED and NWU, 90 in ENU
+    # Headings (°) of the x axis of the positions in this motion if there is no heading error. With
+    # z down, x is north. With z up, x is north in NWU, and east in ENU: if the frames of the
+    # orientation do not show which, both are possible
     if axis_permutation.vertical_sign > 0 or convention.frames == "FLU to NWU":
         expected_x_axis_headings_deg = [0.0]
     elif convention.frames == "FLU to ENU":
         expected_x_axis_headings_deg = [90.0]
-    else:  # z points up: NWU or ENU
+    else:
         expected_x_axis_headings_deg = [0.0, 90.0]
+    # Use the most likely rotation with the axes and unit that are already determined. Here, the key
+    # "EKF2" only means that the heading has no drift
     for hypothesis in search_hypotheses(positions, {"EKF2": imu_motion}):
         if (
             hypothesis.has_rotation

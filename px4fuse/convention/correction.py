@@ -74,14 +74,15 @@ class ConventionFaults:
     is_ambiguous: bool = False
 
     @property
+    def has_axes_to_correct(self) -> bool:
+        """True if the positions must be rotated or mirrored to NED."""
+        return self.has_wrong_axes or self.rotation_deg != 0.0
+
+    @property
     def has_position_fault(self) -> bool:
         """True if axes, rotation, unit or timestamps of the positions are wrong."""
         return bool(
-            self.has_wrong_axes
-            or self.rotation_deg
-            or self.has_wrong_unit
-            or self.late_s
-            or self.clock_drift
+            self.has_axes_to_correct or self.has_wrong_unit or self.late_s or self.clock_drift
         )
 
     def __bool__(self) -> bool:
@@ -96,26 +97,32 @@ def find_convention_faults(
         return ConventionFaults()
     orientation_fault = _find_orientation_fault(convention)
     if convention.verdict == "ambiguous":
-        best_convention = format_axes(convention.axes, convention.unit)
         # NED in metres, with any rotation and delay
         is_ned_likely = any(
             convention_text.startswith(format_axes(FRAME_AXES["NED"], "m"))
-            for convention_text in (best_convention, *convention.alternatives)
+            for convention_text in (
+                format_axes(convention.axes, convention.unit),
+                *convention.alternatives,
+            )
         )
         return ConventionFaults(orientation=orientation_fault, is_ambiguous=not is_ned_likely)
     if convention.verdict != "determined":
         return ConventionFaults(orientation=orientation_fault)
     is_fused = is_source_fused(flight)
     has_wrong_axes, rotation_deg = _find_axis_fault_and_rotation(convention)
+    # The rotation is a fault of the positions only if its reference is correct:
+    # - With a wrong heading of the source, the orientation is the fault
     has_wrong_heading = orientation_fault in ("order", "heading")
+    # - If EKF2 fused the yaw of the source, EKF2's heading is no reference for the positions
     uses_gyro_heading = convention.heading_from == "gyroscopes"
-    # EKF2 fused the yaw of the source, so EKF2's heading is no reference for the positions
     is_heading_from_source = (
         is_fused
         and uses_gyro_heading
         and convention.orientation is not None
         and orientation_fault != "copied"
     )
+    # - The heading of the gyroscopes drifts. For a source that EKF2 did not fuse, it shows wrong
+    #   axes, but not a rotation
     has_no_heading_reference = uses_gyro_heading and not is_fused and not has_wrong_axes
     # The positions are not rotated if the orientation has a wrong heading (it is then the fault),
     # if no independent heading is known, or in an FRD frame, which has no fixed rotation from north
@@ -137,11 +144,13 @@ def find_convention_faults(
 
 def _find_axis_fault_and_rotation(convention: Convention) -> tuple[bool, float]:
     """Return True if the axes are not NED, and the clockwise rotation (°) of the positions."""
+    # Wrong axes: the sent frame is the nearest one of right angles, so the fault is this frame and
+    # the small rotation that is left
     rotation_deg, is_z_up = convention.rotation_deg, convention.z == "up"
     is_enu_or_nwu = convention.axes in (FRAME_AXES["ENU"], FRAME_AXES["NWU"])
     if convention.is_mirrored or is_enu_or_nwu or convention.z not in ("up", "down"):
         return True, rotation_deg if abs(rotation_deg) > MIN_RESIDUAL_ROTATION_DEG else 0.0
-    # The x axis points north in NED, and east in ENU (z up)
+    # Otherwise, the frame is NED (x north), or ENU (z up, x east), rotated by any angle
     total_rotation_deg = _compute_angle_from_x_to_north_deg(convention) + 90.0 * is_z_up
     total_rotation_deg = math.remainder(total_rotation_deg, 360.0)
     return is_z_up, total_rotation_deg if abs(total_rotation_deg) > MIN_FRAME_ROTATION_DEG else 0.0
@@ -160,6 +169,8 @@ def _find_orientation_fault(convention: Convention) -> OrientationFault:
         return "copied"
     if orientation.order != "w x y z":
         return "order"
+    # Frames with z up are consistent with positions with z up, so they are a fault only if the z
+    # axis of the positions is known to be down. All other frames are always a fault
     is_z_known_to_be_down = convention.verdict == "determined" and convention.z == "down"
     has_z_up_frames = orientation.frames in ("FLU to ENU", "FLU to NWU")
     if orientation.frames != "FRD to NED" and (is_z_known_to_be_down or not has_z_up_frames):
@@ -209,7 +220,7 @@ def _replace_attitude(flight: Flight, convention: Convention, faults: Convention
     if inertial_data is None:
         return flight
     attitude = inertial_data.compute_attitudes()[convention.heading_from]
-    if not faults.has_wrong_axes and not faults.rotation_deg:
+    if not faults.has_axes_to_correct:
         heading_change_rad = np.radians(_compute_angle_from_x_to_north_deg(convention))
         attitude = replace_heading(attitude, heading(attitude) + heading_change_rad)
     attitude_table = pd.DataFrame(attitude, time_index(inertial_data.time_s), Columns.QUATERNION)
@@ -218,12 +229,15 @@ def _replace_attitude(flight: Flight, convention: Convention, faults: Convention
 
 def _make_matrix_to_ned_metres(convention: Convention, faults: ConventionFaults) -> Array:
     metres_per_unit = METRES_PER_UNIT[convention.unit]
-    if not faults.has_wrong_axes and not faults.rotation_deg:
+    if not faults.has_axes_to_correct:
         return metres_per_unit * np.eye(3)
+    # Row: north, east or down. Column: 1 if this axis of the source has that direction, -1 if it
+    # has the opposite direction
     signed_permutation_matrix = [
         [(axis == name) - (OPPOSITE_DIRECTION[axis] == name) for axis in convention.axes]
         for name in FRAME_AXES["NED"]
     ]
+    # The positions are rotated clockwise, so they are rotated back counterclockwise (negative)
     is_rotated = abs(convention.rotation_deg) > MIN_RESIDUAL_ROTATION_DEG
     rotation_rad = -np.radians(convention.rotation_deg) * is_rotated
     cosine, sine = np.cos(rotation_rad), np.sin(rotation_rad)

@@ -57,11 +57,10 @@ class LeverArm(NamedTuple):
         return float(np.hypot(self.forward_m, self.right_m))
 
 
-def find_imu_position_m(flight: Flight) -> tuple[float, float, float]:
+def find_imu_position_m(flight: Flight) -> list[float]:
     """Return the position of the IMU (m, body FRD) that EKF2 assumes."""
     parameters = {} if isinstance(flight.ekf2, Unavailable) else flight.ekf2.parameters
-    x, y, z = (parameters.get(name, 0.0) for name in IMU_POSITION_PARAMETERS)
-    return x, y, z
+    return [parameters.get(name, 0.0) for name in IMU_POSITION_PARAMETERS]
 
 
 def estimate_lever_arm(flight: Flight, track: PositionTrack) -> LeverArm | None:
@@ -79,10 +78,9 @@ def estimate_lever_arm(flight: Flight, track: PositionTrack) -> LeverArm | None:
 def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverArm | None:
     """Fit offset, lever arm, delay and rotation to the position errors against ground truth."""
     attitude, columns = flight.attitude, Columns.POSITION[:2]
-    airborne_spans_s = () if isinstance(flight.airborne, Unavailable) else flight.airborne
-    position_samples = track.samples[columns].dropna()
-    if airborne_spans_s:
-        position_samples = position_samples.loc[airborne_spans_s[0][0] : airborne_spans_s[-1][1]]
+    position_samples, airborne_s = track.samples[columns].dropna(), flight.airborne
+    if airborne_s and not isinstance(airborne_s, Unavailable):
+        position_samples = position_samples.loc[airborne_s[0][0] : airborne_s[-1][1]]
     if isinstance(attitude, Unavailable) or len(position_samples) < 2:
         return None
     time_s, truth_samples = position_samples.index.to_numpy(), truth.samples
@@ -92,6 +90,8 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
             for name in columns
         ]
     )
+    # Errors per second of delay, and per radian of rotation: the derivative of a rotation is a
+    # rotation by 90°. Without the mean, the rotation does not change the offset
     velocity_m_s = np.gradient(true_positions_m, time_s, axis=0)
     error_per_radian_m = _rotate(true_positions_m - np.nanmean(true_positions_m, axis=0), 90.0)
     # Columns: derivatives of the position error with respect to lever arm (forward, right), offset
@@ -112,7 +112,9 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
         np.sqrt(np.nanmean(error_per_radian_m**2)), MIN_RMS_DISTANCE_FROM_PATH_MEAN_M
     )
     rotation_deg = 0.0
-    for _ in range(LEVER_ARM_FIT_COUNT):  # a large rotation is not linear: rotate, fit again
+    # The fit is linear in the rotation. A large rotation is not linear, so the fit is repeated with
+    # positions that are rotated back by the estimate
+    for _ in range(LEVER_ARM_FIT_COUNT):
         error_m = _rotate(position_samples.to_numpy(), -rotation_deg) - true_positions_m
         valid_position_errors_m = error_m[is_known].ravel()
         scaled_parameters, _, rank, _ = np.linalg.lstsq(
@@ -194,7 +196,7 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
         second_difference_error_m = source_motion.second_differences - horizontal_imu_m
         design_rows = design[is_used].reshape(-1, design.shape[2])
         valid_second_difference_errors_m = second_difference_error_m[is_used].ravel()
-        # Second differences of overlapping time windows are not independent
+        # Second differences with common positions are not independent. One spans 2 windows
         independent_difference_count = (
             len(valid_second_difference_errors_m)
             * GRID_INTERVAL_S
@@ -209,15 +211,17 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
             second_difference_error_m - design @ fitted_parameters, axis=1
         )
         sigma_m = np.sqrt(np.mean(residual_m[is_used] ** 2) / 2.0)
+        # Least-squares covariance, increased for correlated second differences
         covariance = (
             np.linalg.pinv(design_rows.T @ design_rows)
             * sigma_m**2
             * len(valid_second_difference_errors_m)
             / independent_difference_count
         )
+        # Corrections for the next fit: no outliers, and corrected timestamps and rotation
         is_used &= residual_m < MAX_RESIDUAL_SIGMAS * sigma_m
-        # Fitted parameter 2: time (s) by which the timestamps are early
-        time_s = time_s + fitted_parameters[2]
+        early_s = fitted_parameters[2]
+        time_s = time_s + early_s
         rotation_deg += float(np.degrees(fitted_parameters[-1]))
     # The fitted lever arm is relative to the IMU, EKF2's parameters are relative to the vehicle's
     # origin: add the position of the IMU

@@ -23,7 +23,7 @@ from px4fuse.core.arrays import (
     interpolate_columns,
 )
 from px4fuse.ekf2.replay import is_inside_spans
-from px4fuse.filter.signals import Segment, find_imu_gaps, interpolate_attitude
+from px4fuse.filter.signals import Segment, find_gap_free_spans, interpolate_attitude
 from px4fuse.flight.model import Columns, Flight, Spans, Unavailable
 from px4fuse.trajectory.association import choose_gap_limit_s, is_bracketed
 from px4fuse.trajectory.rotation import (
@@ -157,6 +157,7 @@ def integrate_inertial_data(flight: Flight) -> InertialData | None:
     )
     if len(time_s) < 4 * SECOND_DIFFERENCE_WINDOW_S / INTEGRATION_STEP_S:
         return None
+    # Mean specific force and rotation in each step: differences of their integrals over time
     imu_integrals = [
         np.interp(time_s, imu_times_s, integrate_cumulatively(imu[name].to_numpy(), imu_times_s))
         for name in Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE
@@ -170,10 +171,7 @@ def integrate_inertial_data(flight: Flight) -> InertialData | None:
     airborne_spans_s = flight.airborne
     if isinstance(airborne_spans_s, Unavailable):
         airborne_spans_s = ((time_s[0], time_s[-1]),)
-    gap_rows = np.flatnonzero(find_imu_gaps(imu_times_s))
-    gap_free_spans_s = [
-        *zip([-np.inf, *imu_times_s[gap_rows + 1]], [*imu_times_s[gap_rows], np.inf], strict=True)
-    ]
+    gap_free_spans_s = find_gap_free_spans(imu_times_s)
     return InertialData(
         time_s,
         specific_force_m_s2,
@@ -182,7 +180,7 @@ def integrate_inertial_data(flight: Flight) -> InertialData | None:
         tuple(
             valid_span_s
             for start_s, end_s in airborne_spans_s
-            for valid_span_s in Segment(start_s, end_s, "").clip_spans(gap_free_spans_s)
+            for valid_span_s in Segment(start_s, end_s, reason="").clip_spans(gap_free_spans_s)
         ),
     )
 
@@ -211,6 +209,9 @@ def _integrate_gyros(rotation_rad: Array, logged_attitude: Array) -> Array:
 
 def _level_attitude(attitude: Array, specific_force_m_s2: Array) -> Array:
     """Correct the tilt of an attitude, so that the mean specific force is vertical."""
+    # Over LEVELLING_WINDOW_S, the mean acceleration of the vehicle is small, so the mean specific
+    # force is the reaction to gravity (up). Two passes of the mean make a triangular window, which
+    # smooths better than a rectangular one
     mean_specific_force_m_s2 = rotate(to_rotation_matrix(attitude[:-1]), specific_force_m_s2)
     for _ in range(2):
         mean_specific_force_m_s2 = running_mean(
@@ -218,9 +219,11 @@ def _level_attitude(attitude: Array, specific_force_m_s2: Array) -> Array:
             np.ones(len(mean_specific_force_m_s2), dtype=bool),
             round(LEVELLING_WINDOW_S / INTEGRATION_STEP_S),
         )
+    # The lower limit (m/s²) prevents a division by zero
     vertical = mean_specific_force_m_s2 / np.maximum(
         np.linalg.norm(mean_specific_force_m_s2, axis=1, keepdims=True), 1.0
     )
+    # For small tilt errors, the cross product is the rotation vector from this vertical to up
     levelling_rotation = from_rotation_vector(np.cross(vertical, [0.0, 0.0, -1.0]))
     return multiply(np.concatenate([levelling_rotation, levelling_rotation[-1:]]), attitude)
 
@@ -274,11 +277,13 @@ def integrate_imu_motion(inertial_data: InertialData, attitude: Array) -> ImuSec
     displacement_m -= table
     displacement_m *= INTEGRATION_STEP_S**2
     np.cumsum(displacement_m, axis=0, out=position_m[1:])
+    # Keep one second difference per GRID_INTERVAL_S
     window_steps = round(SECOND_DIFFERENCE_WINDOW_S / INTEGRATION_STEP_S)
     stride = round(GRID_INTERVAL_S / INTEGRATION_STEP_S)
     second_differences = compute_second_differences(position_m, window_steps)[::stride]
     time_s = inertial_data.time_s[window_steps:-window_steps][::stride]
-    # A second difference needs valid data before and after its time
+    # A second difference needs valid data during SECOND_DIFFERENCE_WINDOW_S before and after its
+    # time, without the end of a valid span or the start of the next one
     is_valid = is_inside_spans(time_s, inertial_data.valid_spans_s)
     for (_, end), (start, _) in pairwise(inertial_data.valid_spans_s):
         is_valid &= (time_s < end - SECOND_DIFFERENCE_WINDOW_S) | (
@@ -300,8 +305,5 @@ def filter_imu_motion(
 
 def replace_heading(attitude: Array, heading_rad: Array) -> Array:
     """Rotate an attitude about the vertical to another heading."""
-    half_angle_rad = np.unwrap(heading_rad - heading(attitude)) / 2.0
-    zeros = np.zeros_like(half_angle_rad)
-    return multiply(
-        np.stack([np.cos(half_angle_rad), zeros, zeros, np.sin(half_angle_rad)], axis=-1), attitude
-    )
+    rotation_rad = np.outer(np.unwrap(heading_rad - heading(attitude)), [0.0, 0.0, 1.0])
+    return multiply(from_rotation_vector(rotation_rad), attitude)

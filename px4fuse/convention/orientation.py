@@ -121,12 +121,11 @@ def determine_orientation_convention(
             QUATERNION_ORDERS, QUATERNIONS_BY_FRAMES, range(4)
         )
     ]
-    candidates.sort(key=lambda candidate: -candidate.score)
-    best_candidate = candidates[0]
+    best_candidate = max(candidates, key=lambda candidate: candidate.score)
     # Conventions (quaternion order, frames) that differ only in heading are not alternatives: the
     # heading error is determined with the positions
-    second_best_candidate = next(
-        candidate
+    second_best_score = max(
+        candidate.score
         for candidate in candidates
         if candidate.order_and_frames_up_to_heading != best_candidate.order_and_frames_up_to_heading
     )
@@ -136,7 +135,7 @@ def determine_orientation_convention(
         or best_candidate.heading_difference_deg > MAX_HEADING_DIFFERENCE_DEG
     ):
         orientation_convention = replace(orientation_convention, verdict="unrelated")
-    elif best_candidate.score - second_best_candidate.score < MIN_CONVENTION_SCORE_LEAD:
+    elif best_candidate.score - second_best_score < MIN_CONVENTION_SCORE_LEAD:
         orientation_convention = replace(orientation_convention, verdict="ambiguous")
     return (
         orientation_convention,
@@ -169,13 +168,17 @@ def _score_convention(
     is allowed: the positions determine the heading error.
     """
     convention = OrientationConvention(verdict="determined", order=order, frames=frames)
+    # The sensor can be mounted with a yaw of a multiple of 90°
     body_rotation = from_rotation_vector(np.array([0.0, 0.0, body_quarter_turns * np.pi / 2.0]))
     attitude = multiply(convert_to_attitude(sent_quaternions, convention), body_rotation)
+    # Heading differences, relative to their mean. Unit complex numbers give the mean of angles
     heading_difference_phasor = np.exp(1j * (heading(attitude) - heading(reference_attitude)))
     mean_heading_difference_rad = np.angle(np.mean(heading_difference_phasor))
     heading_difference_rad = np.abs(
         np.angle(heading_difference_phasor * np.exp(-1j * mean_heading_difference_rad))
     )
+    # Tilt: angle between the vertical directions in the body frame, which are the third rows of the
+    # rotation matrices
     tilt_difference_cosine = np.sum(
         to_rotation_matrix(attitude)[:, 2] * to_rotation_matrix(reference_attitude)[:, 2], axis=1
     )
@@ -183,13 +186,16 @@ def _score_convention(
     tilt_difference_deg, heading_difference_deg = np.degrees(
         np.median([tilt_difference_rad, heading_difference_rad], axis=1)
     ).tolist()
+    # Log likelihood: -(number of independent samples) · Σ ln(median difference). This number is
+    # proportional to the duration
     log_angle_differences = np.log(
         np.maximum([tilt_difference_deg, heading_difference_deg], MIN_ANGLE_DIFFERENCE_IN_SCORE_DEG)
     )
     score = (
         -ANGLE_DIFFERENCE_WEIGHT_PER_S * (time_s[-1] - time_s[0]) * np.sum(log_angle_differences)
     )
-    # Log prior odds: PX4's convention, and a sensor without rotation, are more probable
+    # Assumed log prior odds (nats): PX4's convention, and a sensor without rotation or heading
+    # error, are more probable
     if order != "w x y z":
         score -= 4.0
     if frames != "FRD to NED":

@@ -39,6 +39,9 @@ def find_axes_in_file(axes: AxisDirections, frame: str) -> AxisDirections:
     frame : str
         Frame from which the positions were converted to NED, for example "ENU".
     """
+    # DIRECTIONS are the directions of x, y, z, -z, -y, -x after a correct conversion, and ``axes``
+    # with their opposites are the true ones. For example, a column that ``frame`` defines as up is
+    # the -z axis after the conversion, so its true direction is the opposite of axes[2]
     true_directions = dict(zip(DIRECTIONS, append_opposites(axes), strict=True))
     x, y, z = (true_directions[name] for name in FRAME_AXES[frame])
     return x, y, z
@@ -73,6 +76,7 @@ def describe_axes(
     if frame_name:
         title = f"{frame_name} positions {'read' if is_file else 'sent'} as {stated_frame}"
     fault = f"{title}: x is {x}, y {y}, z {z}{' (left-handed frame)' if is_mirrored else ''}"
+    # Same order as append_opposites: for x east, y north, z up, the direction down is -z
     source_axis_by_direction = dict(
         zip(append_opposites(axes), ("x", "y", "z", "-z", "-y", "-x"), strict=True)
     )

@@ -123,13 +123,14 @@ class Consistency(NisVerdict, kw_only=True):
             )
         normalised_innovation = usable_innovation_m / np.sqrt(variance_m2)
         std_m = float(np.std(usable_innovation_m, ddof=1))
-        mean_t_statistic = float(np.sqrt(innovation_count) * np.mean(usable_innovation_m) / std_m)
+        mean_m = float(np.mean(usable_innovation_m))
+        mean_t_statistic = float(np.sqrt(innovation_count) * mean_m / std_m)
         lag_count = min(MAX_LJUNG_BOX_LAG_COUNT, innovation_count // 5)
         autocorrelations = compute_autocorrelation(normalised_innovation, lag_count)
         ljung_box_terms = autocorrelations**2 / (innovation_count - np.arange(1, lag_count + 1))
         return cls(
             **_compute_nis_verdict_fields(normalised_innovation**2),
-            innovation_mean_m=float(np.mean(usable_innovation_m)),
+            innovation_mean_m=mean_m,
             innovation_std_m=std_m,
             sqrt_s_median_m=float(np.median(np.sqrt(variance_m2))),
             fraction_outside_two_sigma=float(np.mean(np.abs(normalised_innovation) > 2.0)),

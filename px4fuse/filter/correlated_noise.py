@@ -155,17 +155,19 @@ def _undo_low_pass(
     rho = np.zeros(len(time_s))
     if tau_s:
         rho[has_no_gap] = np.exp(-interval_s[has_no_gap] / tau_s)
-    previous_position_m = np.concatenate([measured_m[:1], measured_m[:-1]])
+    # The first position has no previous one; its ρ is 0
+    previous_position_m = np.roll(measured_m, 1, axis=0)
     unfiltered_m = (measured_m - rho[:, None] * previous_position_m) / (1.0 - rho)[:, None]
     # The unfiltered position is computed from a position and the previous position. Exclude both
     # unfiltered positions that are computed from an outlier
-    is_computed_from_outlier = is_outlier | (has_no_gap & np.append(False, is_outlier[:-1]))
+    is_computed_from_outlier = is_outlier | (has_no_gap & np.roll(is_outlier, 1))
     motion = compute_motion(
         time_s[~is_computed_from_outlier], unfiltered_m[~is_computed_from_outlier]
     )
     if isinstance(motion, Unavailable):
         return motion, 0.0
-    # The first position of a segment sets the initial state, and is not part of the likelihood
+    # The first position of a segment sets the initial state, and is not part of the likelihood. Its
+    # index is a segment edge; the last edge is the end
     is_used = np.isin(time_s, np.delete(motion.time_s, motion.segment_edges[:-1]))
     return motion, measured_m.shape[1] * float(np.sum(np.log1p(-rho[is_used])))
 
@@ -180,6 +182,7 @@ def _fit_low_pass(
 
     def fit_noises(log_tau: float) -> tuple[float, float]:
         """Return the score (-ln p) and SIGMA_Z for a given time constant."""
+        # -ln p of the measured positions = -ln p of the unfiltered positions - ln |Jacobian|
         motion, minus_log_jacobian = undo_low_pass(float(np.exp(log_tau)))
         # The times of the positions are the same for each τ. fit_time_correlation has computed the
         # IMU motion at these times before
@@ -194,6 +197,8 @@ def _fit_low_pass(
         options={"xatol": LOG_TAU_TOLERANCE},
     ).x
     score, sigma_z_m = fit_noises(log_tau)
+    # Filtered positions are a sum of previous ones with the weights (1 - ρ) ρ^k. Their mean age is
+    # ρ / (1 - ρ) intervals
     correlation = float(np.exp(-interval_s / np.exp(log_tau)))
     lag_s = interval_s * correlation / (1.0 - correlation)
     return SourceLowPass(correlation, lag_s, white_noise_score - score, sigma_z_m)
@@ -237,9 +242,7 @@ def fit_time_correlation(
     time_s = time_s[middle_rows]
     measured_m = np.column_stack([axis.measurement_m[middle_rows] for axis in axes])
     for jump in jumps:
-        measured_m = measured_m - np.outer(
-            time_s >= jump.time_s, [step.value for step in jump.step_m]
-        )
+        measured_m -= np.outer(time_s >= jump.time_s, [step.value for step in jump.step_m])
     compute_motion = partial(
         compute_imu_motion,
         flight,
@@ -270,12 +273,14 @@ def fit_time_correlation(
             COARSE_CORRELATED_VARIANCE_FRACTIONS, COARSE_CORRELATION_TIMES_S
         )
     ]
-    # Scores are -ln p of the positions, so the lowest score is the best
+    # 1. Coarse search with and without time-correlated noise. Scores are -ln p of the positions, so
+    # the lowest score is the best
     downsampled_motion = imu_motion.downsample(COARSE_SEARCH_MEASUREMENT_COUNT)
-    search_coarse_grid = partial(_search_coarse_grid, downsampled_motion, tested_offsets_s)
-    coarse_white_noise_score, _ = search_coarse_grid([noise_parameters])
-    coarse_correlated_noise_score, correlated_start_parameters = search_coarse_grid(
-        correlated_candidates
+    coarse_white_noise_score, _ = _search_coarse_grid(
+        downsampled_motion, tested_offsets_s, [noise_parameters]
+    )
+    coarse_correlated_noise_score, correlated_start_parameters = _search_coarse_grid(
+        downsampled_motion, tested_offsets_s, correlated_candidates
     )
     is_sigma_z_small = sigma_z_m < MAX_SIGMA_Z_OF_LOW_PASS_SOURCE_M
     if (
@@ -283,12 +288,13 @@ def fit_time_correlation(
         and not is_sigma_z_small
     ):
         return no_low_pass, no_correlation_found
+    # 2. Fit of the noises with all positions, starting at the best values of the coarse search
     white_noise_fit, _ = _fit_noises_at_best_offset(imu_motion, tested_offsets_s, noise_parameters)
     correlated_noise_fit, offset_s = _fit_noises_at_best_offset(
         imu_motion, tested_offsets_s, correlated_start_parameters
     )
     white_noise_score = white_noise_fit.compute_score()
-    # A low-pass filter is fitted only if the noise is time-correlated or very small
+    # 3. A low-pass filter is fitted only if the noise is time-correlated or very small
     gain_nats = white_noise_score - correlated_noise_fit.compute_score()
     is_correlated = gain_nats >= MIN_LIKELIHOOD_GAIN_NATS
     if not (is_correlated or is_sigma_z_small):
@@ -302,6 +308,8 @@ def fit_time_correlation(
     source_low_pass = low_pass if low_pass.gain_nats > 0.0 else no_low_pass
     if not is_correlated:
         return source_low_pass, no_correlation_found
+    # Both gains are relative to white noise, so their difference compares low pass and correlated
+    # noise. If the correlated noise has its own time offset, it has one parameter more
     fitted_parameters = correlated_noise_fit.noise_parameters
     return source_low_pass, TimeCorrelatedNoise(
         tau_s=fitted_parameters.tau_s,
@@ -340,6 +348,7 @@ def fit_time_correlation_to_truth(
             MIN_TRUTH_LIKELIHOOD_GAIN_NATS, noise_fitted_with_imu.gain_nats
         )
         low_pass_likelihood_gain_nats = noise_fitted_with_imu.low_pass_gain_nats
+    # 1. Positions near a sample of ground truth, without outliers, downsampled
     true_track = pd.concat([truth["position_m"] for truth in truths], axis=1).dropna()
     measurement_time_s = np.setdiff1d(axes[0].measurement_time_s, outlier_time_s)
     measurement_time_s = measurement_time_s[
@@ -361,7 +370,9 @@ def fit_time_correlation_to_truth(
     true_m, true_velocity_m_s = (
         true_spline(measurement_time_s + clock_offset_s, order) for order in (0, 1)
     )
-    # A time offset of a flight part changes the position along each axis by offset · velocity
+    # 2. Residuals: errors without the systematic errors, which are one constant, scale and rotation
+    # (true_m), a time offset of each flight part, and the jumps. A time offset changes the position
+    # along each axis by offset · velocity
     is_in_flight_part = np.eye(FLIGHT_PART_COUNT)[
         FLIGHT_PART_COUNT * np.arange(position_count) // position_count
     ]
@@ -382,8 +393,13 @@ def fit_time_correlation_to_truth(
         return noise_fitted_with_imu
     white_noise_score = 0.5 * len(residuals) * np.log(np.mean(residuals**2, axis=0)).sum()
 
+    # 3. Log likelihood for each τ and each fraction f of time-correlated noise
     @cache
     def compute_scores_and_variances(tested_tau_s: float) -> ArrayPair:
+        """Return -ln p and the most likely σ² for each tested fraction f.
+
+        In the eigenvectors of C, the covariance is diagonal for all f: σ² (1 - f + f · eigenvalue).
+        """
         correlation_matrix = (
             basis_without_systematic_errors.T
             @ np.exp(-np.abs(measurement_time_s[:, None] - measurement_time_s) / tested_tau_s)
@@ -418,6 +434,7 @@ def fit_time_correlation_to_truth(
     best_gain_nats = likelihood_gains_nats.max()
     if best_gain_nats < min_likelihood_gain_nats:
         return noise_fitted_with_imu
+    # 4. 95 % interval of τ from the profile likelihood
     first_tau_index, last_tau_index = np.flatnonzero(
         likelihood_gains_nats > best_gain_nats - MAX_LOG_LIKELIHOOD_DROP
     )[[0, -1]]
@@ -439,9 +456,8 @@ def fit_time_correlation_to_truth(
 def _fit_noises_at_best_offset(
     imu_motion: PositionsAndImuMotion, offsets_s: Sequence[float], start_parameters: NoiseParameters
 ) -> tuple[NoiseFit, float]:
-    fits = {offset_s: imu_motion.fit_noises(offset_s, start_parameters) for offset_s in offsets_s}
-    best_offset_s = min(fits, key=lambda offset_s: fits[offset_s].compute_score())
-    return fits[best_offset_s], best_offset_s
+    fits = [(imu_motion.fit_noises(offset_s, start_parameters), offset_s) for offset_s in offsets_s]
+    return min(fits, key=lambda fit_and_offset: fit_and_offset[0].compute_score())
 
 
 def _search_coarse_grid(
@@ -449,7 +465,11 @@ def _search_coarse_grid(
     offsets_s: Sequence[float],
     candidate_parameters: Sequence[NoiseParameters],
 ) -> tuple[float, NoiseParameters]:
-    """Return the lowest score (-ln p) and its noises from a grid of time offsets and noises."""
+    """Return the lowest score (-ln p) and its noises from a grid of time offsets and noises.
+
+    Noises: each candidate, with SIGMA_A multiplied by COARSE_SIGMA_A_FACTORS, then with all σ
+    multiplied by COARSE_SIGMA_FACTORS. One fit gives the scores for all common factors.
+    """
     scored_parameters = []
     for positions in map(imu_motion.make_positions_at_offset, offsets_s):
         for candidate, sigma_a_factor in product(candidate_parameters, COARSE_SIGMA_A_FACTORS):
@@ -467,6 +487,7 @@ def _search_coarse_grid(
                 )
             )
     lowest_score, factor, noise_parameters = min(scored_parameters, key=lambda scored: scored[0])
+    # All parameters are σ, except the time constant
     best_parameters = {
         name: value * factor for name, value in vars(noise_parameters).items() if name != "tau_s"
     }

@@ -21,6 +21,11 @@ class _LazyDistribution:
 
 
 def _import_kalman_filter() -> Any:
+    """Import KalmanFilter, with a stub for scipy.stats during the import.
+
+    filterpy.kalman imports two distributions of scipy.stats, which KalmanFilter hardly needs. The
+    stub replaces them by objects that import scipy.stats at their first use.
+    """
     if "scipy.stats" not in sys.modules:
         stub_module = ModuleType("scipy.stats")
         for name in ("norm", "multivariate_normal"):

@@ -123,13 +123,16 @@ class NegativeLogLikelihood:
     ) -> None:
         self.positions_by_axis = positions_by_axis
         self.measurement_weights = measurement_weights
-        self.sigma_z_m = sigma_z_m
+        # The grid requires that a common factor on SIGMA_A and SIGMA_Z scales all covariances. This
+        # is not true with process noise that is independent of SIGMA_A (IMU gaps)
         self.is_interpolated = not any(
             positions.process_noise_independent_of_sigma_a.any() for positions in positions_by_axis
         )
 
+        # Node i of the grid has the coordinate i · GRID_NODE_SPACING
         @cache
         def fit_axes(ratio_index: int) -> list[PositionFit]:
+            """Fit each axis with the ratio SIGMA_A / SIGMA_Z of a grid node."""
             sigma_a_m_s2 = exp(GRID_NODE_SPACING * ratio_index) * sigma_z_m
             return [
                 fit_constant_errors(
@@ -140,12 +143,14 @@ class NegativeLogLikelihood:
 
         @cache
         def compute_scores_at_nodes(ratio_index: int, first_sigma_z_index: int) -> Array:
+            """Return -ln p at the ratio of one node, and at GRID_NODE_COUNT successive SIGMA_Z."""
             sigmas_z_m = np.exp(GRID_NODE_SPACING * (first_sigma_z_index + GRID_NODES))
-            scores_by_axis = [
-                axis_fit.compute_scores(sigmas_z_m / sigma_z_m)[:, 0]
-                for axis_fit in fit_axes(ratio_index)
-            ]
-            return np.asarray(np.sum(scores_by_axis, axis=0))
+            return np.asarray(
+                sum(
+                    axis_fit.compute_scores(sigmas_z_m / sigma_z_m)[:, 0]
+                    for axis_fit in fit_axes(ratio_index)
+                )
+            )
 
         self._compute_scores_at_nodes = compute_scores_at_nodes
 
@@ -163,6 +168,7 @@ class NegativeLogLikelihood:
         log_ratio = log(noise_parameters.sigma_a_m_s2) - log_sigma_z
         ratio_index, ratio_weights = _interpolate_between_nodes(log_ratio / GRID_NODE_SPACING)
         sigma_z_index, sigma_z_weights = _interpolate_between_nodes(log_sigma_z / GRID_NODE_SPACING)
+        # Rows: ratios; columns: SIGMA_Z. Polynomial interpolation in both directions
         scores_at_nodes = [
             self._compute_scores_at_nodes(ratio_index + node, sigma_z_index)
             for node in range(GRID_NODE_COUNT)
@@ -236,6 +242,7 @@ def negative_log_likelihood(
     measurement_weights: Array,
 ) -> float:
     """Return -ln p of the measurements of all axes, without the constant term with ln 2π."""
+    # One batch, which contains all segments. Its scores have one value: [factor 0, time offset 0]
     return float(
         sum(
             fit_constant_errors(
@@ -322,12 +329,13 @@ def convert_to_positions_and_increments(
     The only constant errors are those of KF's initial position and velocity. Their prior variances
     are KF's initial covariance.
     """
+    # Row 0 is KF's initial state, which has a strong prior and no measurement
     measurement_count = len(preintegrated_motion.measurement_m)
     prior_precision = np.zeros((measurement_count + 1, 2))
     prior_precision[0] = KNOWN_INITIAL_STATE_PRECISION
     measured_m = np.append(np.nan, preintegrated_motion.measurement_m)[:, None]
-    # One axis and one time offset. Inputs: the flight data, then the effects of an initial position
-    # error of 1 m and of an initial velocity error of 1 m/s
+    # Shape (axes, time offsets, inputs, intervals), with one axis and one time offset. Inputs: the
+    # data, then unit errors of the initial position and of the initial velocity
     dp, dv = np.zeros((2, 1, 1, 3, measurement_count))
     dp[0, 0, 0] = preintegrated_motion.delta_position_m
     dv[0, 0, 0] = preintegrated_motion.delta_velocity_m_s
@@ -373,7 +381,8 @@ def maximise_likelihood(
         return _fit_noises_and_outliers(
             positions_by_axis, start_parameters, measurement_weights, fits_outliers
         )
-    # In a long flight, a fit to the first measurements gives the initial values
+    # In a long flight, a fit to the first measurements gives the initial values. The positions may
+    # have one row more than the weights, KF's initial state, so the number of omitted rows is used
     omitted_count = len(measurement_weights) - INITIAL_FIT_MEASUREMENT_COUNT
     first_fit = _fit_noises_and_outliers(
         [
@@ -409,6 +418,7 @@ def _fit_noises_and_outliers(
     )
     noise_parameters = _maximise_by_gradient(likelihood, start_parameters)
     for _ in range(MAX_OUTLIER_ITERATIONS if fits_outliers else 0):
+        # 1. Squared errors in units of SIGMA_Z², with SIGMA_Z limited by a robust estimate
         normalised_squares, measured_axis_counts = _estimate_normalised_squares(
             positions_by_axis, noise_parameters, measurement_weights
         )
@@ -424,6 +434,7 @@ def _fit_noises_and_outliers(
             sigma_z_m, MAX_SIGMA_Z_TO_MEDIAN_BASED_SIGMA_Z_RATIO * robust_sigma_z_m
         )
         normalised_squares *= (sigma_z_m / limited_sigma_z_m) ** 2
+        # 2. Outliers: E step and M step
         previous_probability = outlier_probability
         for _ in range(outlier_iterations_per_fit):
             outlier_probability = outliers.compute_probability(
@@ -433,9 +444,11 @@ def _fit_noises_and_outliers(
                 outlier_probability, normalised_squares, measured_axis_counts
             )
         has_outliers = outlier_probability.sum() >= 1.0 or outlier_probability.max() >= 0.5
+        # Without outliers until now, keep the fit to all measurements
         if not has_outliers and not previous_probability.any():
             outlier_probability = previous_probability
             break
+        # 3. Noises, with a small weight for outliers
         measurement_weights = outliers.compute_weights(outlier_probability)
         likelihood = NegativeLogLikelihood(
             positions_by_axis, measurement_weights, start_parameters.sigma_z_m
@@ -489,6 +502,8 @@ def _estimate_normalised_squares(
     """
     squared_errors_and_axis_counts = []
     for positions in positions_by_axis:
+        # First estimate the constant errors (such as biases), to subtract their effect. There is
+        # only one time offset
         constant_errors = fit_constant_errors(
             [positions], noise_parameters, measurement_weights
         ).estimate_constant_errors_by_segment()[:, 0]
@@ -517,6 +532,8 @@ def compute_variance_factor_of_ln_sigma_z(
     outliers. Method: missing information (Louis 1982). ``normalised_squares`` contains the squared
     error of each measurement ÷ SIGMA_Z², summed over its ``measured_axis_counts`` axes.
     """
+    # A measurement with the standard deviation σ (SIGMA_Z, or ratio · SIGMA_Z for an outlier) has
+    # the information 2 on ln σ for each axis. An outlier depends on ln SIGMA_Z and on ln ratio
     outlier_fraction = np.mean(outlier_probability)
     sigma_z_information = 2.0 * float(np.sum(measured_axis_counts))
     outlier_information = 2.0 * float(np.sum(measured_axis_counts * outlier_probability))
@@ -539,6 +556,7 @@ def compute_variance_factor_of_ln_sigma_z(
             np.ones_like(normalised_squares),
         ]
     )
+    # Missing information: variance of the score, because it is unknown which of both applies
     missing_information = (scores * (outlier_probability * (1.0 - outlier_probability))) @ scores.T
     observed_information = information_with_known_outliers - missing_information
     # With very few outliers, the information matrix may not be positive definite

@@ -19,6 +19,7 @@ from px4fuse.trajectory.rotation import heading
 
 from .fitting import NoiseParameters, fit_constant_errors, maximise_likelihood
 from .imu_motion import (
+    HEADING_INDEX_IN_CONSTANT_ERRORS,
     MAX_IMU_INTERVAL_S,
     MIN_SEGMENT_MEASUREMENTS,
     MotionCache,
@@ -56,9 +57,6 @@ MAX_HEADING_CHANGE_AT_CONVERGENCE_RAD = 0.01
 HEADING_SIGMA_RAD = 1.0
 # Lower limit of the estimated ratio of true to measured distances, which is a divisor
 MIN_TRUE_TO_MEASURED_SCALE = 0.1
-# Index of the heading error among the constant errors of a segment. In the IMU increments and their
-# derivatives, the index is larger by 1, because index 0 contains the increments
-HEADING_INDEX_IN_CONSTANT_ERRORS = 2
 
 
 class HeadingErrorInPart(Record):
@@ -94,13 +92,10 @@ class HeadingError(Record):
     drift_p: Share
     by: Literal["orientation", "positions"]
 
-    def find_extreme_parts(self) -> tuple[HeadingErrorInPart, HeadingErrorInPart]:
+    def find_extreme_parts(self) -> list[HeadingErrorInPart]:
         """Return flight parts with the smallest and the largest misalignment, in time order."""
-        heading_errors_deg = [heading_part.heading_error_deg for heading_part in self.parts]
-        first_index, last_index = sorted(
-            (int(np.argmin(heading_errors_deg)), int(np.argmax(heading_errors_deg)))
-        )
-        return self.parts[first_index], self.parts[last_index]
+        sorted_parts = sorted(self.parts, key=lambda part: part.heading_error_deg)
+        return sorted((sorted_parts[0], sorted_parts[-1]), key=lambda part: part.start_s)
 
 
 def combine_heading_parts(
@@ -245,16 +240,11 @@ def _compare_orientations(
     heading_errors_of_parts = _average_flight_parts(time_s, misalignment_rad, sigma_rad)
     if len(heading_errors_of_parts) < MIN_FLIGHT_PART_COUNT:
         return None
-    heading_errors_deg = np.array(
-        [heading_part.heading_error_deg for heading_part in heading_errors_of_parts]
-    )
-    chi_square = (
-        np.sum((heading_errors_deg - heading_errors_deg.mean()) ** 2) / np.degrees(sigma_rad) ** 2
-    )
+    heading_errors_deg = [part.heading_error_deg for part in heading_errors_of_parts]
+    part_count = len(heading_errors_deg)
+    chi_square = part_count * np.var(heading_errors_deg) / np.degrees(sigma_rad) ** 2
     return combine_heading_parts(
-        heading_errors_of_parts,
-        float(chdtrc(len(heading_errors_of_parts) - 1, chi_square)),
-        "orientation",
+        heading_errors_of_parts, float(chdtrc(part_count - 1, chi_square)), "orientation"
     )
 
 
@@ -275,6 +265,8 @@ def _estimate_heading_error_from_positions(
         HEADING_FIT_DURATION_S, 2 * MIN_SEGMENT_MEASUREMENTS * compute_median_interval_s(time_s)
     )
     motion_cache = MotionCache()
+    # 1. Mean heading error. The fit is linear in the heading error, so it is repeated with
+    # positions that are rotated back by the estimate
     misalignment_rad = 0.0
     for _ in range(MAX_HEADING_FIT_ITERATIONS):
         cosine, sine = np.cos(misalignment_rad), np.sin(misalignment_rad)
@@ -306,23 +298,21 @@ def _estimate_heading_error_from_positions(
         )
         error_rad = error_rad[is_part_long_enough]
         heading_variance_rad2 = heading_variance_rad2[is_part_long_enough]
-        # The fit is linear in the heading error, so it is repeated with rotated positions
         correction_rad, weight_sum = np.average(
             error_rad, weights=1.0 / heading_variance_rad2, returned=True
         )
         misalignment_rad += float(correction_rad)
         if abs(correction_rad) < MAX_HEADING_CHANGE_AT_CONVERGENCE_RAD:
             break
+    # 2. Heading error of each part: its deviation from the mean, reduced if it is mostly noise
+    # (empirical Bayes). Variance due to drift: variance of the estimates minus their noise variance
     deviation_rad = error_rad - correction_rad
-    # Variance of the heading error due to drift: variance of the estimates of all flight parts
-    # minus their noise variance
-    variance_above_noise_rad2 = max(float(np.mean(deviation_rad**2 - heading_variance_rad2)), 0.0)
-    heading_drift_variance_rad2 = 0.0 if has_constant_heading else variance_above_noise_rad2
+    drift_variance_rad2 = 0.0
+    if not has_constant_heading:
+        drift_variance_rad2 = max(float(np.mean(deviation_rad**2 - heading_variance_rad2)), 0.0)
     # The larger the noise variance of a flight part, the more its estimate is moved to the mean
     # heading error
-    weight_of_part_estimate = heading_drift_variance_rad2 / (
-        heading_drift_variance_rad2 + heading_variance_rad2
-    )
+    weight_of_part_estimate = drift_variance_rad2 / (drift_variance_rad2 + heading_variance_rad2)
     misalignment_rad = float(np.angle(np.exp(1j * misalignment_rad)))
     # One row for each flight part: start, end, heading error, σ
     heading_part_fields = np.column_stack(
@@ -332,6 +322,7 @@ def _estimate_heading_error_from_positions(
             np.degrees(np.sqrt(1.0 / weight_sum + weight_of_part_estimate * heading_variance_rad2)),
         ]
     )
+    # 3. Test for a constant heading error
     chi_square = float(np.sum(deviation_rad**2 / heading_variance_rad2))
     is_drift_tested = len(heading_variance_rad2) > 1 and not has_constant_heading
     return combine_heading_parts(
@@ -346,9 +337,9 @@ def _fit_heading_errors(
 ) -> tuple[NoiseParameters, Array, Array]:
     """Fit the noises; return them, and heading error (rad) and variance (rad²) of each segment."""
     positions_and_increments = motion.make_positions_at_offset(0.0)
-    # Derivative of the motion with respect to the heading error: motion along the smooth path (last
-    # input of the fit), rotated by 90°. With the motion from the IMU, which is noisy, the estimated
-    # heading error would be too small
+    # Effect of a heading error: motion along the smooth path through the positions, rotated by 90°.
+    # This motion is the last input, the derivative with respect to the scale factor. With the noisy
+    # motion from the IMU, the estimate would be too small. Shape (axes, time offsets, inputs, ...)
     for increments in (
         positions_and_increments.delta_position_m,
         positions_and_increments.delta_velocity_m_s,
@@ -366,9 +357,9 @@ def _fit_heading_errors(
     )
     constant_errors = position_fit.estimate_constant_errors_by_segment()[:, 0]
     covariance = np.linalg.inv(position_fit.compute_constant_error_information())[:, 0]
-    # The smooth path, and with it the derivative above, has the scale of the measured positions.
-    # But a heading error rotates the true motion: divide the fitted heading error by the ratio of
-    # true to measured distances
+    # The smooth path has the scale of the measured positions, but a heading error rotates true
+    # distances: divide the fitted heading error by the ratio of true to measured distances. The
+    # last constant error, the scale factor error, is 1 minus this ratio
     true_to_measured_scale = np.maximum(1.0 - constant_errors[:, -1], MIN_TRUE_TO_MEASURED_SCALE)
     return (
         noise_parameters,

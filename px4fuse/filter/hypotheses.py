@@ -18,11 +18,11 @@ import numpy as np
 import pandas as pd
 from scipy import constants
 from scipy.linalg import cho_factor, cho_solve
-from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, integrate_cumulatively
-from px4fuse.flight.model import Columns, Flight, Unavailable
+from px4fuse.flight.model import Flight, Unavailable
+from px4fuse.trajectory.rotation import to_rotation_matrix
 
 from .likelihood import (
     PreintegratedMotion,
@@ -33,7 +33,7 @@ from .likelihood import (
     preintegrate,
 )
 from .settings import Settings
-from .signals import Acceleration, Axis, report_too_few_measurements
+from .signals import Acceleration, Axis, interpolate_attitude, report_too_few_measurements
 from .steps import make_prediction_steps
 
 ANALYSIS_NAME = "accelerometer bias, scale factor error and position jumps"
@@ -243,6 +243,8 @@ def _fit_scale(design_matrix: DesignMatrix, is_skipped: BoolArray) -> Estimate:
     tested_scales = TESTED_SCALE_FACTORS.tolist()
     fit_scale = cache(lambda index: design_matrix.fit(is_skipped, tested_scales[index]))
 
+    # Minimum of the parabola through the lowest score and its neighbours
+
     def compute_score(index: int) -> float:
         # The term ln S of the likelihood is omitted, because it would bias the scale factor to zero
         return fit_scale(index).residual_and_prior_square_sum / 2.0
@@ -254,11 +256,13 @@ def _fit_scale(design_matrix: DesignMatrix, is_skipped: BoolArray) -> Estimate:
     if curvature <= 0.0:
         return Estimate(0.0, math.inf)
     grid_step = tested_scales[1] - tested_scales[0]
-    # At the ends of the tested range, do not extrapolate by more than half a grid step
+    # At the ends of the tested range, where the centre is the last but one value, do not
+    # extrapolate by more than half a grid step
     best_scale = tested_scales[centre_index] + float(np.clip(vertex_shift, -1.5, 1.5)) * grid_step
     centre_fit = fit_scale(centre_index)
     # The linearised rotation by θ (x - θ y, y + θ x) lengthens the acceleration by √(1 + θ²)
     lengthening_factor = math.hypot(1.0, centre_fit.coefficients[FRAME_ROTATION_COLUMN])
+    # σ from the curvature of -ln p, increased if the residuals are larger than expected
     return Estimate(
         float(best_scale * lengthening_factor - 1.0),
         grid_step / math.sqrt(curvature) * max(centre_fit.residual_rms, 1.0),
@@ -296,6 +300,7 @@ def _find_jumps(
         return is_skipped | _is_in_window(time_s, jump_time_s, OUTLIER_BURST_DURATION_S)
 
     for _ in range(MAX_JUMPS):
+        # 1. Times to test: an outlier whose predecessor is none starts a run of outliers
         outlier_run_starts_s = time_s[
             np.flatnonzero(is_skipped & ~np.append(False, is_skipped[:-1]))
         ]
@@ -306,6 +311,8 @@ def _find_jumps(
             *_find_significant_jump_times(design_matrix, fit, is_skipped, outlier_run_starts_s),
             *_find_significant_jump_times(design_matrix, fit, is_skipped, measurement_times_s)[:1],
         ]
+        # 2. Test of a jump at each time, with a smaller false alarm probability, because several
+        # times are tested (Bonferroni)
         max_false_alarm_p = MAX_JUMP_FALSE_ALARM_P / max(len(outlier_run_starts_s), 1)
         tested_jumps = [
             _test_jump(
@@ -316,9 +323,11 @@ def _find_jumps(
         significant_jumps = [jump for jump in tested_jumps if jump]
         if not significant_jumps:
             break
+        # 3. Exact time of the most significant jump, and corrected mask of outliers
         best_jump, is_skipped = _locate_jump(
             design_matrix, is_skipped, max(significant_jumps, key=lambda jump: jump.chi_square)
         )
+        # Search the next jump with this one in the fit
         jumps.append(best_jump)
         design_matrix = replace(design_matrix, jump_times_s=[jump.time_s for jump in jumps])
         fit = design_matrix.fit(is_skipped)
@@ -361,12 +370,14 @@ def _compute_jump_chi_squares(
     candidate_times_s: Array,
 ) -> Array:
     """Return χ² of a jump at each time: the decrease of the sum of squared residuals."""
+    # Score test: a jump is not fitted. The innovations due to a jump of 1 m (jump_response) are
+    # compared with the residuals of the fit without the jump
     _, columns = design_matrix.compute_innovations_and_design_matrix(fit_without_jump.gains)
     columns_by_axis = np.split(columns, design_matrix.axis_count)
     chi_squares = np.zeros(len(candidate_times_s))
     for first in range(0, len(candidate_times_s), JUMP_BATCH_SIZE):
         batch = slice(first, first + JUMP_BATCH_SIZE)
-        # Jumps have no effect on earlier innovations
+        # Jumps have no effect on earlier innovations, so the rows begin at the first jump
         rows = slice(np.searchsorted(design_matrix.time_s, candidate_times_s[first]), None)
         is_used = ~is_skipped[rows]
         unit_steps = make_unit_steps(design_matrix.time_s[rows], candidate_times_s[batch])
@@ -412,6 +423,7 @@ def _locate_jump(
     # First test the measurements after the jump: in the fit without the jump, correct measurements
     # seemed to be outliers. Then test the measurements near the jump, for each possible jump time
     is_skipped = np.where(is_after_jump, test_for_outliers(jump.time_s), is_skipped)
+    # 2. Choose the times near the jump with the largest χ², with all measurements near it
     candidate_times_s = time_s[is_near_jump]
     is_skipped_away_from_jump = is_skipped & ~is_near_jump
     best_indices = np.argsort(
@@ -422,17 +434,16 @@ def _locate_jump(
             candidate_times_s,
         )
     )[:MAX_CANDIDATE_JUMP_TIMES]
-    outlier_mask_by_jump_time = {
-        jump_time_s: np.where(is_near_jump, test_for_outliers(jump_time_s), is_skipped)
+    # 3. With a jump at each of these times, test the measurements near it
+    masks_and_jump_times = [
+        (np.where(is_near_jump, test_for_outliers(jump_time_s), is_skipped), jump_time_s)
         for jump_time_s in candidate_times_s[best_indices].tolist()
-    }
+    ]
     # With a wrong jump time, correct measurements seem to be outliers. The best jump time has the
     # fewest outliers
-    best_jump_time_s = min(
-        outlier_mask_by_jump_time,
-        key=lambda jump_time_s: np.count_nonzero(outlier_mask_by_jump_time[jump_time_s]),
+    is_skipped, best_jump_time_s = min(
+        masks_and_jump_times, key=lambda mask_and_time: np.count_nonzero(mask_and_time[0])
     )
-    is_skipped = outlier_mask_by_jump_time[best_jump_time_s]
     regression, jump_columns = design_matrix.fit_with_jump(best_jump_time_s, is_skipped)
     step_m = tuple(map(regression.estimate, jump_columns))
     return replace(jump, time_s=best_jump_time_s, step_m=step_m), is_skipped
@@ -545,6 +556,7 @@ class DesignMatrix:
         Return also the column index of this jump in the design matrix, for each axis.
         """
         jump_times_s = [*self.jump_times_s, jump_time_s]
+        # The jumps are the last columns: all jumps along the first axis, then along the next
         last_column = len(self.prior_sigma) - 1
         jump_columns = [
             last_column + len(jump_times_s) * (1 + axis) for axis in range(self.axis_count)
@@ -554,7 +566,11 @@ class DesignMatrix:
     def compute_normalised_innovations(
         self, dp: Array, dv: Array, measured_m: Array, gains: Array
     ) -> Array:
-        """Run KF on several inputs; return normalised innovations ν/√S, one column per input."""
+        """Run KF on several inputs; return normalised innovations ν/√S, one column per input.
+
+        The inputs may be those of the last measurements only. ``gains`` has the rows S, position
+        gain and velocity gain.
+        """
         preintegrated_inputs = replace(
             self.preintegrated_inputs,
             interval_s=self.preintegrated_inputs.interval_s[-len(dp) :],
@@ -572,6 +588,7 @@ class DesignMatrix:
         ``scale`` is a trial scale factor of the positions; the acceleration is multiplied by it.
         ``is_skipped`` is True for measurements that are not used.
         """
+        # 1. Normalised innovations and design matrix
         gains = compute_gains(
             self.preintegrated_inputs, scale * self.sigma_a_m_s2, self.sigma_z_m, is_skipped
         )
@@ -579,18 +596,19 @@ class DesignMatrix:
         sum_of_log_variances = self.axis_count * float(np.sum(np.log(gains[0, ~is_skipped])))
         is_used = np.tile(~is_skipped, self.axis_count)
         used_innovations, used_columns = normalised_innovations[is_used], columns[is_used]
-        # Ridge regression: the slow error has a prior, constant errors and jumps have none
+        # 2. Ridge regression: the slow error has a prior, constant errors and jumps have none
         prior_precision = np.zeros(columns.shape[1])
         prior_precision[: len(self.prior_sigma)] = self.prior_sigma**-2.0
         information = np.diag(prior_precision) + used_columns.T @ used_columns
         # A small diagonal prevents a singular matrix: in hover, a rotation of the source frame has
         # no effect on the innovations
-        information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(len(information))
+        information += 1e-12 * np.diag(np.diag(information) + 1.0)
         right_hand_side = used_columns.T @ used_innovations
         information_factor = cho_factor(information)
         covariance = cho_solve(information_factor, np.eye(len(information)))
         coefficients = covariance @ right_hand_side
-        # Sum of squared residuals, and of squared coefficients over prior variances
+        # 3. Sum of squared residuals, and of squared coefficients over prior variances. At the
+        # minimum, with the design matrix A and data y, it is yᵀy - xᵀAᵀy
         square_sum = float(used_innovations @ used_innovations - coefficients @ right_hand_side)
         log_determinant = 2.0 * float(np.sum(np.log(np.diag(information_factor[0]))))
         degrees_of_freedom = max(len(used_innovations) - CONSTANT_ERROR_COLUMN_COUNT, 1)
@@ -614,13 +632,12 @@ class DesignMatrix:
         along the next axis.
         """
         inputs, axis_count = self.preintegrated_inputs, self.axis_count
-        input_count = inputs.measurement_m.shape[1]
+        axis_input_count = INPUTS_PER_AXIS * axis_count
         # The scale factor multiplies the inputs of KF that contain measured acceleration. For each
         # axis, these are the flight data (first input of the axis) and the effect of a yaw rotation
-        input_scale_factors = np.ones(input_count)
-        acceleration_input_indices = INPUTS_PER_AXIS * np.arange(axis_count)
-        input_scale_factors[acceleration_input_indices] = scale
-        input_scale_factors[acceleration_input_indices + 1 + FRAME_ROTATION_COLUMN] = scale
+        input_scale_factors = np.ones(inputs.measurement_m.shape[1])
+        factors_by_axis = input_scale_factors[:axis_input_count].reshape(axis_count, -1)  # a view
+        factors_by_axis[:, [0, 1 + FRAME_ROTATION_COLUMN]] = scale
         unit_steps = make_unit_steps(self.time_s, self.jump_times_s)
         zero_increments = np.zeros_like(unit_steps)
         responses = self.compute_normalised_innovations(
@@ -631,10 +648,12 @@ class DesignMatrix:
         )
         # Order of KF's inputs: flight data and constant errors of each axis, slow acceleration
         # errors, jumps
-        *responses_by_axis, slow_error_responses, jump_responses = np.split(
-            responses, [*(acceleration_input_indices + INPUTS_PER_AXIS), input_count], axis=1
+        axis_responses, slow_error_responses, jump_responses = np.split(
+            responses, [axis_input_count, len(input_scale_factors)], axis=1
         )
-        stacked_responses = np.vstack(responses_by_axis)
+        # The rows of each axis below those of the previous one. Columns: flight data, then the
+        # constant errors, which are common to all axes
+        stacked_responses = np.vstack(np.split(axis_responses, axis_count, axis=1))
         # Slow errors and jumps of an axis have no effect on the other axis
         columns = [
             stacked_responses[:, 1:],
@@ -678,19 +697,18 @@ def make_design_matrix(
         )
 
     velocity_errors_per_unit_bias_and_yaw = _integrate_unit_errors(attitude, acceleration)
-    # Δp (m) and Δv (m/s) between the measurements, for each input of KF: flight data and constant
-    # errors of each axis, then slow acceleration errors
-    increments: list[ArrayPair] = []
-    for axis, preintegrated_motion in zip(axes, preintegrated_motions, strict=True):
-        increments.append(
-            (preintegrated_motion.delta_position_m, preintegrated_motion.delta_velocity_m_s)
-        )
-        increments += [
-            integrate_between_measurements(velocity_error_m_s @ axis.direction, error_time_s)
-            for error_time_s, velocity_error_m_s in velocity_errors_per_unit_bias_and_yaw
+    # Inputs of KF in the order of DesignMatrix.preintegrated_inputs: Δp (m) and Δv (m/s) between
+    # the measurements, and positions (m). Only the flight data contain positions
+    zeros = np.zeros(len(time_s))
+    inputs: list[tuple[Array, Array, Array]] = []
+    for axis, motion in zip(axes, preintegrated_motions, strict=True):
+        inputs.append((motion.delta_position_m, motion.delta_velocity_m_s, motion.measurement_m))
+        inputs += [
+            (*integrate_between_measurements(velocity_m_s @ axis.direction, error_time_s), zeros)
+            for error_time_s, velocity_m_s in velocity_errors_per_unit_bias_and_yaw
         ]
-    # The slow acceleration error is linear between knots; its time grid has 20 steps from knot to
-    # knot
+    # The slow acceleration error is linear between knots. Its inputs are triangles: 1 m/s² at one
+    # knot, 0 at the others, sampled 20 times per interval between knots
     slow_error_knot_interval_count = int(
         np.clip(
             np.ceil((time_s[-1] - time_s[0]) / SLOW_ERROR_KNOT_SPACING_S), 1, MAX_SLOW_ERROR_KNOTS
@@ -700,17 +718,10 @@ def make_design_matrix(
     slow_error_time_s += clock_offset_s
     for knot_values in np.eye(slow_error_knot_interval_count + 1):
         slow_error = np.interp(slow_error_time_s, slow_error_time_s[::20], knot_values)
-        increments.append(
-            integrate_between_measurements(
-                integrate_cumulatively(slow_error, slow_error_time_s), slow_error_time_s
-            )
-        )
-    dp, dv = np.transpose(increments, (1, 2, 0))
-    # Only the flight data (first input of each axis) contain measured positions
-    measured_m = np.zeros_like(dp)
-    measured_m[:, : INPUTS_PER_AXIS * len(axes) : INPUTS_PER_AXIS] = np.transpose(
-        [motion.measurement_m for motion in preintegrated_motions]
-    )
+        velocity_m_s = integrate_cumulatively(slow_error, slow_error_time_s)
+        inputs.append((*integrate_between_measurements(velocity_m_s, slow_error_time_s), zeros))
+    # Shape (measurements, inputs)
+    dp, dv, measured_m = np.transpose(inputs, (1, 2, 0))
     preintegrated_inputs = replace(
         preintegrated_motions[0],
         delta_position_m=dp,
@@ -737,10 +748,8 @@ def _integrate_unit_errors(attitude: pd.DataFrame, acceleration: Acceleration) -
 
     Each of the three errors is a pair: times (s), and velocity errors (m/s) at these times.
     """
-    body_to_ned = Rotation.from_quat(
-        attitude[Columns.QUATERNION].to_numpy(copy=True), scalar_first=True
-    ).as_matrix()
     attitude_time_s = attitude.index.to_numpy()
+    body_to_ned = to_rotation_matrix(interpolate_attitude(attitude, attitude_time_s))
     north, east, _ = acceleration.acceleration_integral_m_s
     return [
         *(

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 import pandas as pd
@@ -54,13 +55,16 @@ from .marginal_likelihood import (
     subtract_smooth_path,
 )
 from .model import compute_continuous_process_noise_per_density
-from .signals import find_imu_gaps
+from .signals import Segment, find_gap_free_spans
 
 # Prior σ (rad) of the errors of tilt and heading at the start of a segment
 HEADING_SIGMA_RAD = 0.05
 # Prior σ of the constant errors of a segment: initial attitude (rad), gyro bias (rad/s) and
 # accelerometer bias (m/s²) along three axes, and position scale (1)
 PRIOR_SIGMAS_OF_CONSTANT_ERRORS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
+# Index of the heading error in the constant errors. Its index in the IMU increments is larger by 1,
+# because index 0 is the motion itself
+HEADING_INDEX_IN_CONSTANT_ERRORS = 2
 # A gyro bias above this limit (rad/s; 5 σ of the prior) is subtracted from the gyro data before the
 # constant errors are fitted to the positions
 MAX_PRIOR_GYRO_BIAS_RAD_S = 0.02
@@ -170,9 +174,7 @@ class PositionsAndImuMotion:
             measurement_m=self.measurement_m[is_kept],
             measurement_weights=self.measurement_weights[is_kept],
             segment_edges=np.cumsum([0, *kept_measurement_counts[has_enough_measurements]]),
-            segment_motions=tuple(
-                self.segment_motions[index] for index in np.flatnonzero(has_enough_measurements)
-            ),
+            segment_motions=tuple(compress(self.segment_motions, has_enough_measurements)),
         )
 
     def make_positions_and_increments(self, time_offsets_s: Array) -> PositionsAndIncrements:
@@ -199,17 +201,20 @@ class PositionsAndImuMotion:
         ):
             measurement_time_s = self.time_s[begin:end]
             # Shape (axes, time offsets, 10, times). The third dimension is the motion from the IMU,
-            # then its derivatives with respect to the nine constant errors of attitude and IMU
+            # then its derivatives with respect to the nine constant errors of attitude and IMU.
+            # tensordot projects NED onto the axes, and swapaxes puts the time offsets second
             position, velocity = (
                 np.swapaxes(np.tensordot(self.directions, signal, 1), 1, 2)
                 for signal in segment_motion.interpolate(
                     measurement_time_s + time_offsets_s[:, None]
                 )
             )
-            # All columns except that of the scale factor error
+            # All columns except that of the scale factor error, in the intervals of this segment
             interval_rows = np.s_[:, :, :-1, begin : end - 1]
             dv[interval_rows] = np.diff(velocity)
             dp[interval_rows] = np.diff(position) - velocity[..., :-1] * np.diff(measurement_time_s)
+        prior_sigmas = PRIOR_SIGMAS_OF_CONSTANT_ERRORS.copy()
+        prior_sigmas[HEADING_INDEX_IN_CONSTANT_ERRORS] = self.heading_sigma_rad
         return PositionsAndIncrements(
             measurement_m=self.measurement_m,
             segment_start_indices=self.segment_edges[:-1],
@@ -217,11 +222,7 @@ class PositionsAndImuMotion:
             process_noise_per_sigma_a_squared=process_noise_per_sigma_a_squared,
             process_noise_independent_of_sigma_a=np.zeros_like(process_noise_per_sigma_a_squared),
             prior_precision=prior_precision,
-            prior_sigmas_of_constant_errors=np.r_[
-                PRIOR_SIGMAS_OF_CONSTANT_ERRORS[:2],
-                self.heading_sigma_rad,
-                PRIOR_SIGMAS_OF_CONSTANT_ERRORS[3:],
-            ],
+            prior_sigmas_of_constant_errors=prior_sigmas,
             delta_position_m=dp,
             delta_velocity_m_s=dv,
         )
@@ -395,7 +396,7 @@ def compute_imu_motion(
 
 
 def _split_into_segments(
-    time_s: Array, covered_spans_s: list[Span], max_segment_duration_s: float
+    time_s: Array, covered_spans_s: tuple[Span, ...], max_segment_duration_s: float
 ) -> list[IntArray]:
     """Return the rows of the positions in each segment.
 
@@ -416,14 +417,13 @@ def _split_into_segments(
     return [rows for rows in rows_by_segment if len(rows) >= MIN_SEGMENT_MEASUREMENTS]
 
 
-def _find_covered_spans(imu_time_s: Array, attitude_time_s: Array) -> list[Span]:
+def _find_covered_spans(imu_time_s: Array, attitude_time_s: Array) -> tuple[Span, ...]:
     """Find time spans (s) without a gap in IMU or attitude; none if the IMU rate is too low."""
     if len(imu_time_s) < 2 or compute_median_interval_s(imu_time_s) > MAX_IMU_INTERVAL_S:
-        return []
-    gap_indices = np.flatnonzero(find_imu_gaps(imu_time_s))
-    starts_s = np.maximum(imu_time_s[np.r_[0, gap_indices + 1]], attitude_time_s[0])
-    ends_s = np.minimum(imu_time_s[np.r_[gap_indices, len(imu_time_s) - 1]], attitude_time_s[-1])
-    return list(zip(starts_s.tolist(), ends_s.tolist(), strict=True))
+        return ()
+    start_s = max(imu_time_s[0], attitude_time_s[0])
+    end_s = min(imu_time_s[-1], attitude_time_s[-1])
+    return Segment(start_s, end_s, reason="").clip_spans(find_gap_free_spans(imu_time_s))
 
 
 def make_segment_motion(
@@ -434,6 +434,7 @@ def make_segment_motion(
     first_row, end_row = np.searchsorted(
         imu.index.to_numpy(), [imu_span_s[0] - margin_s, imu_span_s[1] + margin_s]
     )
+    # 1. Integrals of specific force and angular rate at the ends of equal steps
     imu = imu.iloc[first_row:end_row]
     imu_time_s = imu.index.to_numpy()
     step_times_s = np.arange(imu_time_s[0], imu_time_s[-1], INTEGRATION_STEP_S)
@@ -443,7 +444,8 @@ def make_segment_motion(
         )
         for names in (Columns.SPECIFIC_FORCE, Columns.ANGULAR_RATE)
     )
-    # The first selected attitude sample is before the first step, for interpolation at this step
+    # 2. Attitude: the gyroscopes without a large bias, integrated from the logged attitude. The
+    # first selected attitude sample is before the first step, for interpolation at this step
     attitude_time_s = attitude.index.to_numpy()
     first_row, end_row = np.searchsorted(attitude_time_s, step_times_s[[0, -1]], side="right")
     attitude_samples = attitude.iloc[max(first_row - 1, 0) : end_row][Columns.QUATERNION]
@@ -452,22 +454,16 @@ def make_segment_motion(
         step_times_s,
         _estimate_large_gyro_bias(step_times_s, gyro_integral_rad, attitude_time_s, quaternions),
     )
-    # The gyroscopes are integrated, starting at the logged attitude
+    step_rotations_rad = np.diff(gyro_integral_rad, axis=0)
+    initial_attitude = interpolate(step_times_s[:1], attitude_time_s, quaternions)
     attitude_quaternion = cumulative_product(
-        np.concatenate(
-            [
-                interpolate(step_times_s[:1], attitude_time_s, quaternions),
-                from_rotation_vector(np.diff(gyro_integral_rad, axis=0)),
-            ]
-        )
+        np.concatenate([initial_attitude, from_rotation_vector(step_rotations_rad)])
     )
-    # Arrays below have one row for each step. The mean specific force f of a step is rotated by the
-    # attitude in the middle of the step
+    # 3. Acceleration and its derivatives; one row for each step. The mean specific force f of a
+    # step is rotated by the attitude in the middle of the step
     mean_specific_force_m_s2 = np.diff(specific_force_integral_m_s, axis=0) / INTEGRATION_STEP_S
     body_to_ned = to_rotation_matrix(
-        multiply(
-            attitude_quaternion[:-1], from_rotation_vector(np.diff(gyro_integral_rad, axis=0) / 2.0)
-        )
+        multiply(attitude_quaternion[:-1], from_rotation_vector(step_rotations_rad / 2.0))
     )
     specific_force_ned_m_s2 = rotate(body_to_ned, mean_specific_force_m_s2)
     acceleration_ned_m_s2 = specific_force_ned_m_s2 + np.array([0.0, 0.0, constants.g])
@@ -486,13 +482,15 @@ def make_segment_motion(
         ],
         axis=2,
     )
+    # 4. Integrate all ten columns twice. Shape (3, 10, steps). position and velocity are views of
+    # the result, in which the sums are written
     acceleration = np.ascontiguousarray(np.moveaxis(acceleration_and_derivatives, 0, -1))
     motion_and_imu_error_derivatives = np.zeros((2, *acceleration.shape))
     position, velocity = motion_and_imu_error_derivatives
     velocity_increments = acceleration[..., :-1] * INTEGRATION_STEP_S
     np.cumsum(velocity_increments, axis=-1, out=velocity[..., 1:])
-    mean_velocity_in_step = velocity[..., :-1] + velocity_increments / 2.0
-    np.cumsum(mean_velocity_in_step * INTEGRATION_STEP_S, axis=-1, out=position[..., 1:])
+    mean_velocity = velocity[..., :-1] + velocity_increments / 2.0
+    np.cumsum(mean_velocity * INTEGRATION_STEP_S, axis=-1, out=position[..., 1:])
     return SegmentMotion(step_times_s[:-1], motion_and_imu_error_derivatives)
 
 

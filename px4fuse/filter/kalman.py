@@ -86,14 +86,14 @@ def run_kf(axis: Axis, settings: Settings, *, fast: bool = False) -> KfRun:
         position_m[index] if index >= 0 else None
         for index in prediction_steps.measurement_index[1:].tolist()  # 0 is the initial state
     ]
-    first_row = (position_m[0], 0.0, *model.INITIAL_COVARIANCE, *NO_UPDATE)
+    # Each row contains a state (STATE_TABLE_COLUMNS), then an update (UPDATE_TABLE_COLUMNS), which
+    # is NaN in the row of the initial state and in steps without a measurement
+    initial_row = (position_m[0], 0.0, *model.INITIAL_COVARIANCE, *NO_UPDATE)
     rows = run_filter(settings, position_m[0], prediction_steps, measurements_m)
-    time_s, column_count = prediction_steps.time_s, len(STATE_TABLE_COLUMNS + UPDATE_TABLE_COLUMNS)
-    # pandas needs twice the time for a list of tuples
-    values = np.fromiter(
-        chain(first_row, chain.from_iterable(rows)), np.float64, len(time_s) * column_count
-    )
-    states, updates = np.split(values.reshape(-1, column_count), [len(STATE_TABLE_COLUMNS)], axis=1)
+    # A list of rows would need more memory
+    time_s, row_type = prediction_steps.time_s, np.dtype((float, len(initial_row)))
+    values = np.fromiter(chain([initial_row], rows), row_type, len(time_s))
+    states, updates = np.split(values, [len(STATE_TABLE_COLUMNS)], axis=1)
     steps = pd.DataFrame(states, pd.Index(time_s, name="time_s"), STATE_TABLE_COLUMNS)
     # No step follows the last state
     steps["acceleration_m_s2"] = np.append(prediction_steps.acceleration_m_s2, 0.0)
@@ -147,14 +147,13 @@ def _run_with_filterpy(
                 measured_m,
                 kalman.y[0, 0],
                 kalman.S[0, 0],
-                K[0, 0],
-                K[1, 0],
+                *K[:, 0],
                 x[0, 0],
                 P[0, 0],
                 P[1, 1],
             )
         x, P = kalman.x, kalman.P
-        yield (x[0, 0], x[1, 0], P[0, 0], P[0, 1], P[1, 1], *update)
+        yield (*x[:, 0], P[0, 0], P[0, 1], P[1, 1], *update)
 
 
 def _run_with_floats(
@@ -178,10 +177,10 @@ def _run_with_floats(
         )
         update = NO_UPDATE
         if measured_m is not None:
-            # ν, S and gains
             innovation_and_gains, updated_state = model.update_step(
                 position, velocity, covariance, measured_m, settings.sigma_z_m**2
             )
+            # UPDATE_TABLE_COLUMNS. Position and variances are those before the update (prior)
             update = measured_m, *innovation_and_gains, position, covariance[0], covariance[2]
             position, velocity, covariance = updated_state
         yield (position, velocity, *covariance, *update)

@@ -194,8 +194,9 @@ def compute_innovations_with_gains(
     right_hand_side[..., 1] = preintegrated_motion.delta_velocity_m_s.T
     right_hand_side[..., 1:, 0] += predicted_position_gain * measured_m[..., :-1]
     right_hand_side[..., 1:, 1] += velocity_gain[:-1] * measured_m[..., :-1]
-    # Coefficients below the unit diagonal of the equations. Indices: measurement, column of p (0)
-    # or v (1), distance below the diagonal
+    # Coefficients below the unit diagonal. Indices: measurement, column (0: p, 1: v), and distance
+    # of the row below the diagonal. The unknowns are p_0, v_0, p_1, v_1, ..., so the equation of
+    # p_i is 2 rows below the column of p_(i-1), and 1 row below that of v_(i-1)
     bands = np.zeros((len(position_gain), 2, 4))
     bands[:-1, 1, 1] = -dt
     bands[:-1, 0, 2] = predicted_position_gain - 1.0
@@ -234,13 +235,8 @@ def compute_profile_likelihood_interval(
     def interpolate_interval_end(inside_index: int, outside_index: int) -> float | None:
         if not 0 <= outside_index < len(grid):
             return None
-        fraction_between_grid_values = (max_log_likelihood_drop - score_rises[inside_index]) / (
-            score_rises[outside_index] - score_rises[inside_index]
-        )
-        return float(
-            grid[inside_index]
-            + fraction_between_grid_values * (grid[outside_index] - grid[inside_index])
-        )
+        indices = [inside_index, outside_index]
+        return float(np.interp(max_log_likelihood_drop, score_rises[indices], grid[indices]))
 
     return interpolate_interval_end(first_index, first_index - 1), interpolate_interval_end(
         last_index, last_index + 1
@@ -270,20 +266,23 @@ def find_profile_likelihood_interval(
     max_sqrt_log_likelihood_drop = float(np.sqrt(MAX_LOG_LIKELIHOOD_DROP * variance_factor))
 
     def find_interval_end(direction: float, search_limit: float) -> float | None:
+        """Return the lower (direction -1) or upper (1) end, or None beyond the search limit."""
         other_log_sigma = best_log_sigmas[1]
 
-        # The 95 % interval ends where this function is zero: √(decrease of the log-likelihood)
-        # minus its limit. This square root is nearly linear in ln σ, so brentq needs few steps
-        @cache
-        def compute_log_likelihood_drop_excess(log_sigma_change: float) -> float:
-            # The search for the second parameter starts at its result for the previous value of the
-            # first parameter
+        @cache  # brentq computes the ends of its bracket again
+        def compute_drop_excess(change: float) -> float:
+            """Return √(decrease of the log-likelihood) minus its limit, after a change of ln σ.
+
+            The interval ends where this is zero. It is nearly linear, so brentq needs few steps.
+            """
+            # At each change, the best value of the other parameter is searched (profile). The
+            # search starts at the result for the previous change
             nonlocal other_log_sigma
-            if log_sigma_change == 0.0:
+            if change == 0.0:  # the maximum-likelihood estimate
                 return -max_sqrt_log_likelihood_drop
-            best_other_sigma_fit = minimize_scalar(
+            profile_fit = minimize_scalar(
                 lambda tested_other_log_sigma: score(
-                    best_log_sigmas[0] + direction * log_sigma_change, tested_other_log_sigma
+                    best_log_sigmas[0] + direction * change, tested_other_log_sigma
                 ),
                 bounds=(
                     other_log_sigma - MAX_OTHER_NOISE_LOG_SIGMA_CHANGE,
@@ -291,26 +290,18 @@ def find_profile_likelihood_interval(
                 ),
                 options={"xatol": OTHER_NOISE_LOG_SIGMA_TOLERANCE},
             )
-            other_log_sigma = float(best_other_sigma_fit.x)
-            return float(
-                np.sqrt(max(best_other_sigma_fit.fun - best_score, 0.0))
-                - max_sqrt_log_likelihood_drop
-            )
+            other_log_sigma = float(profile_fit.x)
+            drop = max(profile_fit.fun - best_score, 0.0)
+            return float(np.sqrt(drop)) - max_sqrt_log_likelihood_drop
 
-        max_log_sigma_change = direction * (float(np.log(search_limit)) - best_log_sigmas[0])
-        # Increase the change of ln σ until the log-likelihood has decreased too much: the interval
-        # ends before this change
-        tried_log_sigma_change = min(INITIAL_LOG_SIGMA_SEARCH_STEP, max_log_sigma_change)
-        while compute_log_likelihood_drop_excess(tried_log_sigma_change) < 0.0:
-            if tried_log_sigma_change == max_log_sigma_change:
+        # First double the change until the decrease is too large: the end is before this change
+        max_change = direction * (float(np.log(search_limit)) - best_log_sigmas[0])
+        outer_change = min(INITIAL_LOG_SIGMA_SEARCH_STEP, max_change)
+        while compute_drop_excess(outer_change) < 0.0:
+            if outer_change == max_change:
                 return None
-            tried_log_sigma_change = min(2.0 * tried_log_sigma_change, max_log_sigma_change)
-        log_sigma_change = brentq(
-            compute_log_likelihood_drop_excess,
-            0.0,
-            tried_log_sigma_change,
-            xtol=1e-3 * tried_log_sigma_change,
-        )
-        return float(np.exp(best_log_sigmas[0] + direction * log_sigma_change))
+            outer_change = min(2.0 * outer_change, max_change)
+        end_change = brentq(compute_drop_excess, 0.0, outer_change, xtol=1e-3 * outer_change)
+        return float(np.exp(best_log_sigmas[0] + direction * end_change))
 
     return find_interval_end(-1.0, parameter_bounds[0]), find_interval_end(1.0, parameter_bounds[1])

@@ -125,6 +125,7 @@ class PositionsAndIncrements:
         for axis, is_axis_measured in enumerate(is_measured.T):
             axes_by_measured_rows[is_axis_measured.tobytes()].append(axis)
         for axes in axes_by_measured_rows.values():
+            # 1. Precision of each state (position and velocity): of its measurement plus its prior
             is_axis_measured = is_measured[:, axes[0]]
             measurement_and_prior_precision = self.prior_precision.copy()
             # A segment with fewer than two measurements does not contribute to the likelihood
@@ -153,7 +154,8 @@ class PositionsAndIncrements:
                 measurement_and_prior_precision,
                 self.correlated_noise,
             )
-            # The weak prior of an unknown initial state must not contribute to the likelihood
+            # 3. factorise subtracts ln(precision) of all states from the log determinant. The weak
+            # prior of an unknown initial state must not contribute, so its term is added back
             is_weak_prior = (measurement_and_prior_precision > 0.0) & ~is_known
             log_precisions = np.log(measurement_and_prior_precision[is_weak_prior])
             system = replace(
@@ -211,22 +213,19 @@ class PositionFit:
         All σ are multiplied by each of ``sigma_factors``. A term that is equal for all time offsets
         is omitted.
         """
-        scaled_gram_matrix = self.gram_matrix / sigma_factors[:, None, None, None, None] ** 2
-        # Gram matrix: row and column 0 belong to the data (positions, IMU increments). The others
-        # belong to the constant errors, which are estimated in units of their prior σ
-        prior_sigmas = self.prior_sigmas_of_constant_errors
-        normalised_information_matrix = scaled_gram_matrix[..., 1:, 1:] * np.outer(
-            prior_sigmas, prior_sigmas
-        ) + np.eye(len(prior_sigmas))
-        normalised_right_hand_side = scaled_gram_matrix[..., 1:, 0] * prior_sigmas
-        cholesky_factor = np.linalg.cholesky(normalised_information_matrix)
-        estimated_constants = np.linalg.solve(
-            normalised_information_matrix, normalised_right_hand_side[..., None]
-        )[..., 0]
+        # Row and column 0: the data d. Other rows and columns: the constant errors e. In units of
+        # their prior σ, their information matrix is G_ee + I. Marginalised over them, -ln p of the
+        # data is ½ (G_dd - G_de (G_ee + I)⁻¹ G_ed) + ½ ln |G_ee + I|
+        units = np.append(1.0, self.prior_sigmas_of_constant_errors)
+        sigma_factors = sigma_factors[:, None, None, None, None]
+        gram_matrix = self.gram_matrix / sigma_factors**2 * np.outer(units, units)
+        information = gram_matrix[..., 1:, 1:] + np.eye(len(units) - 1)
+        right_hand_side = gram_matrix[..., 1:, 0]
+        solution = np.linalg.solve(information, right_hand_side[..., None])[..., 0]
+        square_sum = gram_matrix[..., 0, 0] - np.sum(right_hand_side * solution, axis=-1)
+        # Unlike slogdet, cholesky reports a matrix that is indefinite due to rounding errors
+        cholesky_factor = np.linalg.cholesky(information)
         half_log_determinant = np.log(np.diagonal(cholesky_factor, axis1=-2, axis2=-1)).sum(axis=-1)
-        square_sum = scaled_gram_matrix[..., 0, 0] - np.sum(
-            normalised_right_hand_side * estimated_constants, axis=-1
-        )
         return np.asarray(0.5 * square_sum + half_log_determinant)
 
     def compute_scores(self, sigma_factors: Array = UNIT_SIGMA_FACTOR) -> Array:
@@ -277,6 +276,8 @@ def fit_positions(
         for rows in (slice(axis, axis + 1) for axis in axes):
             measured_axis_m, increments = measured_m[rows], (dp[rows], dv[rows])
             weighted_increments = system.weight_increments(*increments)
+            # Its values are ordered by measurement, then by state: state_count values for each
+            # measurement, so the segment edges below are multiplied by it
             whitened_explained_part = system.whiten_explained_part(
                 measured_axis_m, *weighted_increments
             )
@@ -329,6 +330,7 @@ def subtract_smooth_path(
     measured_m = positions.measurement_m.copy()
     dp = positions.delta_position_m.copy()
     dv = positions.delta_velocity_m_s.copy()
+    # Shapes: (axes, time offsets, measurements) or (axes, time offsets, intervals)
     for axes, system, _ in positions.factorise_equations(
         PATH_SMOOTHER_SIGMA_A_M_S2, np.full(len(measured_m), PATH_SMOOTHER_SIGMA_Z_M**2)
     ):
@@ -341,8 +343,9 @@ def subtract_smooth_path(
         smoothed_state[:, :, positions.segment_start_indices] = 0.0
         path_m = smoothed_state[..., 0]
         path_velocity_m_s = smoothed_state[..., 1]
-        measured_m[:, axes] -= path_m[:, 0].T
+        # Increments of the path, defined like those of the IMU (PositionsAndIncrements)
         path_delta_position_m = np.diff(path_m) - positions.interval_s * path_velocity_m_s[..., :-1]
+        measured_m[:, axes] -= path_m[:, 0].T
         # All tested time offsets have the same measured positions, so the same path is subtracted
         # for all of them: that of the first time offset
         for array, increment in ((dp, path_delta_position_m), (dv, np.diff(path_velocity_m_s))):
@@ -370,20 +373,22 @@ def estimate_squared_errors(
     constant_errors : ndarray, shape (segments, c)
         Estimated constant errors (such as biases).
     """
-    # IMU increments, corrected for the estimated constant errors: data + Σ constant error ·
-    # derivative
+    # Increments without constant errors: data + Σ constant error · derivative. The inputs (k) are
+    # the data with weight 1, and the derivatives with the constant errors as weights
     input_weights = np.insert(constant_errors, 0, 1.0, axis=1)
     # The interval between two measurements belongs to the segment of the later measurement
     input_weights_by_interval = np.repeat(
         input_weights, np.diff([*positions.segment_start_indices, len(variance_m2)]), axis=0
     )[1:]
     dp, dv = (
+        # Sum over the inputs k, for each axis a and interval n; there is only one time offset
         np.einsum("akn,nk->an", increments[:, 0], input_weights_by_interval)
         for increments in (positions.delta_position_m, positions.delta_velocity_m_s)
     )
     expected_squared_error_m2 = np.zeros(len(variance_m2))
     for axes, system, _ in positions.factorise_equations(sigma_a_m_s2, variance_m2):
         measured_m = positions.measurement_m[:, axes].T
+        # A missing measurement remains NaN, so nansum below omits it
         error_m = measured_m - system.solve(np.nan_to_num(measured_m), dp[axes], dv[axes])[..., 0]
         position_variance = np.where(np.isnan(error_m), np.nan, system.position_variance())
         expected_squared_error_m2 += np.nansum(error_m**2 + position_variance, axis=0)
@@ -435,6 +440,8 @@ def compute_segment_inner_products(
         left_and_right_factor_positions_m = np.concatenate(
             [left_factor_positions_m[batch], right_factor_positions_m[batch]], axis=1
         )[:, None]
+        # Inner products of all pairs of inputs, (segments, inputs, inputs). Only those of each u
+        # with its v are returned: the diagonal
         gram_matrix = fit_positions(
             replace(positions, delta_position_m=dp, delta_velocity_m_s=dv),
             sigma_a_m_s2,
@@ -493,11 +500,12 @@ class BandedNormalEquations:
     def whiten_explained_part(self, measured_m: Array, *weighted_increments: Array) -> Array:
         """Return L⁻¹b for each input, shape (..., values), with Ax = b and A = LLᵀ.
 
-        The inner product of two results is the part of the weighted inner product of two inputs
-        that the estimated states x explain.
+        The inner product of two results, b₁ᵀA⁻¹b₂, is the part of the weighted inner product of two
+        inputs that the estimated states x explain.
         """
         right_hand_side = self._make_right_hand_side(measured_m, *weighted_increments)
-        # LAPACK solves a triangular system with unit diagonal 30 % faster
+        # LAPACK solves a triangular system with unit diagonal 30 % faster. With L = UD, D the
+        # diagonal of L, the result is D⁻¹(U⁻¹b)
         diagonal = self.cholesky_factor[0]
         unit_diagonal_factor = self.cholesky_factor / diagonal
         whitened_explained_part, _ = lapack.dtbtrs(
@@ -525,6 +533,8 @@ class BandedNormalEquations:
 
         ``weighted_dp`` and ``weighted_dv`` are Q⁻¹ [Δp, Δv].
         """
+        # Interval i has the prediction residual r = x_(i+1) - F x_i - Δ and the cost rᵀQ⁻¹r. Its
+        # derivative adds Q⁻¹Δ to the rows of x_(i+1), and -FᵀQ⁻¹Δ to the rows of x_i.
         # States: position, velocity, and the time-correlated noise if it is fitted
         right_hand_side = np.zeros((*weighted_dp.shape[:-1], len(self.precision), self.state_count))
         right_hand_side[..., 1:, 0] = weighted_dp
@@ -544,28 +554,20 @@ class BandedNormalEquations:
 
         The information of earlier and of later measurements is added (Fraser and Potter 1969).
         """
-        # Each diagonal block of the Cholesky factor of the normal equations A contains the
-        # information of all measurements up to its own. With A in reverse time order, it contains
-        # the information of all later measurements and its own. Element (i + band, i) of A becomes
-        # element (n - 1 - i, n - 1 - i - band)
-        time_reversed_bands = np.zeros_like(self.bands)
-        number_of_unknowns = self.bands.shape[1]
-        for band in range(4):
-            time_reversed_bands[band, : number_of_unknowns - band] = self.bands[
-                band, : number_of_unknowns - band
-            ][::-1]
-        time_reversed_cholesky_factor, _ = lapack.dpbtrf(
-            time_reversed_bands, lower=1, overwrite_ab=1
-        )
+        # At each measurement, the Cholesky factor of A contains the information of all earlier
+        # measurements. With A in reverse time order, it contains that of all later measurements.
+        # Element (i + band, i) of A, which is column i of the band, becomes element (n - 1 - i, n -
+        # 1 - i - band)
+        time_reversed_bands = [np.roll(row[::-1], -band) for band, row in enumerate(self.bands)]
+        time_reversed_cholesky_factor, _ = lapack.dpbtrf(time_reversed_bands, lower=1)
         # Diagonal blocks (one for each measurement) of the Cholesky factors. In time order they are
         # [[a, 0], [b, c]] for (position, velocity). In reverse time order they are
         # [[d, 0], [e, f]] for (velocity, position)
-        (a, c) = (self.cholesky_factor[0, first_row::2] for first_row in (0, 1))
-        b = self.cholesky_factor[1, 0::2]
-        (d, f) = (time_reversed_cholesky_factor[0, first_row::2][::-1] for first_row in (0, 1))
-        e = time_reversed_cholesky_factor[1, 0::2][::-1]
-        # Information on the state from all measurements: sum of the information LLᵀ from earlier
-        # and from later measurements, minus the diagonal block of A, which both contain
+        (a, c), b = self.cholesky_factor[0].reshape(-1, 2).T, self.cholesky_factor[1, ::2]
+        d, f = time_reversed_cholesky_factor[0].reshape(-1, 2)[::-1].T
+        e = time_reversed_cholesky_factor[1, ::2][::-1]
+        # Sum of both information matrices LLᵀ, minus the diagonal block of A that is in both. The
+        # variance of the position is element 00 of its inverse
         p00 = a**2 + e**2 + f**2 - self.bands[0, 0::2]
         p01 = a * b + d * e - self.bands[1, 0::2]
         p11 = b**2 + c**2 + d**2 - self.bands[0, 1::2]
@@ -625,20 +627,27 @@ def factorise(
     # Elements of Q⁻¹, and the element of FᵀQ⁻¹ in the row of velocity and the column of position
     inverse_q00, inverse_q01, inverse_q11 = inverse_q
     position_velocity_weight = inverse_q00 * interval_s + inverse_q01
-    # A = diag(precision) + Σ [-F I]ᵀ Q⁻¹ [-F I] over the intervals, in LAPACK's band format. Each
-    # state has the element on the diagonal, then the elements below it. The states of the next
-    # measurement begin state_count rows below
+    # A = diag(precision) + Σ [-F I]ᵀ Q⁻¹ [-F I] over the intervals. An interval adds the 2 × 2
+    # block FᵀQ⁻¹F to the states at its start, Q⁻¹ to those at its end, and -Q⁻¹F below the first
+    # block, with Q⁻¹ = [[a, b], [b, c]]:
+    #   FᵀQ⁻¹F = [[a, a dt + b], [a dt + b, (a dt + 2 b) dt + c]]
+    #   Q⁻¹F = [[a, a dt + b], [b, b dt + c]]
+    # LAPACK's band format: each state has its element on the diagonal, then the elements below it.
+    # The states of the next measurement begin state_count rows below
     state_count = 2 if correlated_noise is None else 3
     band_storage = np.zeros((len(measurement_and_prior_precision), state_count, state_count + 2))
     position_bands = band_storage[:, 0]
     velocity_bands = band_storage[:, 1]
     position_bands[:, 0], velocity_bands[:, 0] = measurement_and_prior_precision.T
+    # Q⁻¹ at the end of each interval
     position_bands[1:, 0] += inverse_q00
     position_bands[1:, 1] = inverse_q01
     velocity_bands[1:, 0] += inverse_q11
+    # FᵀQ⁻¹F at its start
     position_bands[:-1, 0] += inverse_q00
     position_bands[:-1, 1] += position_velocity_weight
     velocity_bands[:-1, 0] += (position_velocity_weight + inverse_q01) * interval_s + inverse_q11
+    # -Q⁻¹F below
     position_bands[:-1, state_count] = -inverse_q00
     position_bands[:-1, state_count + 1] = -inverse_q01
     velocity_bands[:-1, state_count - 1] = -position_velocity_weight
@@ -649,6 +658,8 @@ def factorise(
         rho = np.where(is_within_segment, np.exp(-interval_s / tau_s), 0.0)
         # Gauss-Markov process: variance σ_c² at the start of a segment, driving noise (1 - ρ²) σ_c²
         correlated_noise_step_variance_m2 = correlated_sigma_m**2 * np.append(1.0, 1.0 - rho**2)
+        # A measurement contains position + correlated noise, so its precision is in both diagonal
+        # elements and in the element between them
         correlated_noise_bands = band_storage[:, 2]
         position_bands[:, 2] = position_measurement_precision
         correlated_noise_bands[:, 0] = (

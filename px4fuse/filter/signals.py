@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 import pandas as pd
@@ -20,6 +21,7 @@ from px4fuse.core.arrays import (
     compute_median_interval_s,
     integrate_cumulatively,
     iterate_row_blocks,
+    select_intervals,
 )
 from px4fuse.core.record import Span, one_line_repr
 from px4fuse.errors import MissingDataError, SettingsError
@@ -130,14 +132,6 @@ class Axis:
     acceleration: Acceleration | Unavailable
 
     __repr__ = one_line_repr
-
-    def keep_rows(self, rows: slice) -> Axis:
-        """Return the axis with a part of its measurements."""
-        return replace(
-            self,
-            measurement_time_s=self.measurement_time_s[rows],
-            measurement_m=self.measurement_m[rows],
-        )
 
     @property
     def label(self) -> str:
@@ -347,8 +341,9 @@ def integrate_ned_acceleration(
         )
     is_gap = find_imu_gaps(time_s)
     gap_rows = np.flatnonzero(is_gap)
-    # Between the edges of the IMU gaps, cumulative_gap_s is linear, so only its values at the edges
-    # are stored
+    # KF needs the time in gaps during each of its steps: the difference of the total gap time at
+    # both ends of the step. This total is linear between the edges of gaps, so only these are kept.
+    # The second moments give the acceleration variance in gaps, where the acceleration is unknown
     cumulative_gap_s = np.cumsum(np.where(is_gap, np.diff(time_s), 0.0))
     gap_edge_rows = np.unique([0, *gap_rows, *(gap_rows + 1), len(time_s) - 1])
     return Acceleration(
@@ -368,6 +363,13 @@ def find_imu_gaps(time_s: Array) -> BoolArray:
     """Return a mask of the intervals between IMU samples that are gaps, shape (n - 1,)."""
     interval_s = np.diff(time_s)
     return interval_s > max(MIN_IMU_GAP_S, MIN_IMU_GAP_INTERVALS * float(np.median(interval_s)))
+
+
+def find_gap_free_spans(imu_time_s: Array) -> list[Span]:
+    """Return the time spans before, between and after the IMU gaps; the outer ends are infinite."""
+    gaps_s = select_intervals(imu_time_s, find_imu_gaps(imu_time_s))
+    edges_s = [-np.inf, *chain.from_iterable(gaps_s), np.inf]
+    return list(zip(edges_s[::2], edges_s[1::2], strict=True))
 
 
 def compute_mean_step_acceleration(

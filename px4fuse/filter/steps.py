@@ -1,7 +1,6 @@
 """Prediction steps of KF: a step ends at each multiple of DT and at each measurement."""
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -73,34 +72,41 @@ def make_prediction_steps(axis: Axis, settings: Settings) -> PredictionSteps:
     grid_point_count = int(np.floor((measurement_time_s[-1] - start_s) / settings.dt_s + 1e-9)) + 1
     grid_s = start_s + settings.dt_s * np.arange(grid_point_count)
     # Multiples of DT that equal a measurement time are omitted, so that no step has zero length
-    next_index = np.searchsorted(measurement_time_s, grid_s)
-    neighbour_indices = np.clip([next_index - 1, next_index], 0, len(measurement_time_s) - 1)
-    time_to_measurement_s = np.abs(measurement_time_s[neighbour_indices] - grid_s).min(axis=0)
+    measurement_numbers = np.arange(len(measurement_time_s))
+    nearest_index = np.rint(np.interp(grid_s, measurement_time_s, measurement_numbers)).astype(int)
+    time_to_measurement_s = np.abs(measurement_time_s[nearest_index] - grid_s)
     time_s = np.union1d(
         grid_s[time_to_measurement_s > MAX_DIFFERENCE_OF_EQUAL_TIMES_S], measurement_time_s
     )
+    # Attributes of PredictionSteps. A step belongs to the interval of the next measurement at or
+    # after its end
     measurement_index = np.full(len(time_s), -1, dtype=np.intp)
     measurement_index[np.searchsorted(time_s, measurement_time_s)] = np.flatnonzero(is_usable)
     last_steps = np.flatnonzero(measurement_index >= 0)
     interval_index = np.searchsorted(last_steps, np.arange(1, len(time_s)))
-    make_steps = partial(PredictionSteps, time_s, measurement_index, last_steps, interval_index)
-    if settings.input == "zero":
-        zeros = np.zeros(len(time_s) - 1)
-        return make_steps(zeros, zeros, 0.0)
-    if isinstance(axis.acceleration, Unavailable):
-        raise SettingsError(
-            f"The setting `input` is imu, but the axis {axis.name} has no IMU acceleration.",
-            f"{axis.acceleration}",
+    acceleration_m_s2 = gap_s = imu_gap_variance_m2_s4 = np.zeros(len(time_s) - 1)
+    if settings.input == "imu":
+        if isinstance(axis.acceleration, Unavailable):
+            raise SettingsError(
+                f"The setting `input` is imu, but the axis {axis.name} has no IMU acceleration.",
+                f"{axis.acceleration}",
+            )
+        acceleration_m_s2, gap_fraction = compute_mean_step_acceleration(
+            axis.acceleration, axis.direction, time_s
         )
-    mean_acceleration_m_s2, gap_fraction = compute_mean_step_acceleration(
-        axis.acceleration, axis.direction, time_s
+        gap_s = gap_fraction * np.diff(time_s)
+        # Unlike white noise, the unknown acceleration is constant in an IMU gap of T seconds. This
+        # increases the velocity variance by the factor T/DT
+        gap_duration_in_interval_s = np.bincount(interval_index, weights=gap_s)[interval_index]
+        gap_variance_factor = np.maximum(gap_duration_in_interval_s / settings.dt_s, 1.0)
+        mean_square_m2_s4 = axis.acceleration.compute_rms_m_s2(axis.direction) ** 2
+        imu_gap_variance_m2_s4 = gap_fraction * gap_variance_factor * mean_square_m2_s4
+    return PredictionSteps(
+        time_s,
+        measurement_index,
+        last_steps,
+        interval_index,
+        acceleration_m_s2,
+        imu_gap_variance_m2_s4,
+        float(np.sum(gap_s)),
     )
-    gap_s = gap_fraction * np.diff(time_s)
-    # Unlike white noise, the unknown acceleration is constant in an IMU gap of T seconds. This
-    # increases the velocity variance by the factor T/DT
-    gap_duration_in_interval_s = np.bincount(interval_index, weights=gap_s)[interval_index]
-    gap_variance_factor = np.maximum(gap_duration_in_interval_s / settings.dt_s, 1.0)
-    imu_gap_variance_m2_s4 = (
-        gap_fraction * gap_variance_factor * axis.acceleration.compute_rms_m_s2(axis.direction) ** 2
-    )
-    return make_steps(mean_acceleration_m_s2, imu_gap_variance_m2_s4, float(np.sum(gap_s)))

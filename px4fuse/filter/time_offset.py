@@ -192,6 +192,8 @@ def estimate_time_offset(
     )
     if isinstance(imu_motion, Unavailable):
         return imu_motion
+    # 1. Maximum-likelihood time offset: coarse search, then a fine grid with downsampled positions,
+    # then with all. Each result is the middle of the next grid, and sets its width
     progress("time offset")
     downsampled_motion = imu_motion.downsample(COARSE_SEARCH_MEASUREMENT_COUNT)
     offset_s, _ = imu_motion.search_time_offset(noise_parameters)
@@ -205,6 +207,8 @@ def estimate_time_offset(
             LIKELIHOOD_CURVE_HALF_WIDTH_SIGMAS * offset_sigma_s, MIN_LIKELIHOOD_CURVE_HALF_WIDTH_S
         )
         search_half_width_s = TESTED_TO_CURVE_WIDTH_RATIO * likelihood_curve_half_width_s
+    # 2. 95 % interval, with the effect of IMU noise, from the likelihood curve. The results of the
+    # last grid above are used
     offset_variance_factor = _simulate_variance_increase_by_imu_noise(
         imu_motion, offset_s, noise_parameters, offset_sigma_s**-2.0
     )
@@ -232,6 +236,7 @@ def estimate_time_offset(
             "data almost equally well. Possible causes: the flight has little acceleration, or the "
             "positions are noisy"
         )
+    # 3. Change of the time offset in flight
     applied_offset_s = settings.clock_offset_s
     parts: tuple[FlightPartTimeOffset, ...] = ()
     change_p_value = None
@@ -338,11 +343,12 @@ def _simulate_variance_increase_by_imu_noise(
     velocity. Simulated residuals and the velocity noise of the same simulation give the additional
     variance of the score of each group of segments.
     """
+    # 1. Draw noise: noise_series_count independent series for each axis and measurement or interval
     positions_at_offset = imu_motion.make_positions_at_offset(offset_s)
     is_within_segment = positions_at_offset.is_within_segment
     measurement_count = len(imu_motion.time_s)
     axis_count = len(imu_motion.directions)
-    interval_count_within_segments = int(np.count_nonzero(is_within_segment))
+
     rng = np.random.default_rng(measurement_count)
     first_segment_of_each_group = np.arange(
         0, len(imu_motion.segment_motions), FLIGHT_SEGMENTS_PER_SIMULATED_GROUP
@@ -357,24 +363,24 @@ def _simulate_variance_increase_by_imu_noise(
         * positions_at_offset.process_noise_per_sigma_a_squared[:, is_within_segment]
     )
     # Noise of Δp and Δv with the covariance Q, drawn as Δp and Δv given Δp
-    dp, dv = np.zeros((2, axis_count, noise_series_count, measurement_count - 1))
-    dp[..., is_within_segment] = np.sqrt(q00) * draw_normal(interval_count_within_segments)
-    dv[..., is_within_segment] = np.sqrt(q11 - q01**2 / q00) * draw_normal(
-        interval_count_within_segments
-    )
-    dv[..., is_within_segment] += q01 / q00 * dp[..., is_within_segment]
+    dp_noise = np.sqrt(q00) * draw_normal(len(q00))
+    dv_noise = np.sqrt(q11 - q01**2 / q00) * draw_normal(len(q00)) + q01 / q00 * dp_noise
     error_m = noise_parameters.sigma_z_m * draw_normal(measurement_count)
+    # The random walk changes the positions, but not the velocity from the IMU
+    if noise_parameters.random_walk_m:
+        interval_s = positions_at_offset.interval_s[is_within_segment]
+        random_walk_m = noise_parameters.random_walk_m * np.sqrt(interval_s)
+        dp_noise += random_walk_m * draw_normal(len(q00))
+    dp, dv = np.zeros((2, axis_count, noise_series_count, measurement_count - 1))
+    dp[..., is_within_segment], dv[..., is_within_segment] = dp_noise, dv_noise
     # Velocity noise of the IMU: sum of the noise of Δv since the start of the segment
     velocity_noise = np.zeros_like(error_m)
     for begin, end in pairwise(imu_motion.segment_edges.tolist()):
         np.cumsum(dv[..., begin : end - 1], axis=-1, out=velocity_noise[..., begin + 1 : end])
-    # The random walk changes the positions, but not the velocity from the IMU
-    if noise_parameters.random_walk_m:
-        dp[..., is_within_segment] += (
-            noise_parameters.random_walk_m
-            * np.sqrt(positions_at_offset.interval_s[is_within_segment])
-            * draw_normal(interval_count_within_segments)
-        )
+
+    # 2. Inner product of residuals (error_m, dp, dv) and velocity noise, for each segment and
+    # series. Its variance over the series, summed over groups of segments, is the additional
+    # variance of the score
     positions_at_offset, measurement_variance_m2 = add_noises(
         positions_at_offset, noise_parameters, imu_motion.measurement_weights
     )
@@ -391,14 +397,14 @@ def _simulate_variance_increase_by_imu_noise(
 
 def _fit_minimum_and_sigma(grid: Array, scores: Array) -> tuple[float, float]:
     """Fit a parabola to -ln p on a grid; return its minimiser, and σ from its curvature."""
-    minimum_index = int(np.clip(np.argmin(scores), 1, len(grid) - 2))
+    lowest_index = int(np.argmin(scores))
+    middle_index = min(max(lowest_index, 1), len(grid) - 2)
     grid_step = grid[1] - grid[0]
-    parabola_vertex_shift, curvature = fit_parabola_vertex(scores, minimum_index)
+    vertex_shift, curvature = fit_parabola_vertex(scores, middle_index)
     if curvature <= 0.0:
-        return float(grid[int(np.argmin(scores))]), float(grid[-1] - grid[0])
-    return float(
-        grid[minimum_index] + np.clip(parabola_vertex_shift, -1.0, 1.0) * grid_step
-    ), float(grid_step / np.sqrt(curvature))
+        return float(grid[lowest_index]), float(grid[-1] - grid[0])
+    minimiser = grid[middle_index] + np.clip(vertex_shift, -1.0, 1.0) * grid_step
+    return float(minimiser), float(grid_step / np.sqrt(curvature))
 
 
 def _estimate_flight_part_offsets(
@@ -413,6 +419,7 @@ def _estimate_flight_part_offsets(
     ``applied_offset_s`` (s) is added to each offset. Return also the p-value of the test; None with
     fewer than two offsets.
     """
+    # -ln p of each segment at a few time offsets, interpolated to a fine grid
     coarse_offsets_s = offset_s + FLIGHT_PART_OFFSET_DIFFERENCES_S
     coarse_offsets_s = coarse_offsets_s[np.abs(coarse_offsets_s) <= MAX_TESTED_TIME_OFFSET_S]
     segment_scores_at_coarse_offsets = imu_motion.fit_at_offsets(
@@ -428,6 +435,7 @@ def _estimate_flight_part_offsets(
         pairwise(imu_motion.segment_edges), spline(grid_offsets_s), strict=True
     ):
         part_offset_s, sigma_s = _fit_minimum_and_sigma(grid_offsets_s, scores)
+        # σ from the curvature omits the effect of IMU noise on the variance
         sigma_s *= float(np.sqrt(offset_variance_factor))
         if sigma_s < MAX_SEGMENT_OFFSET_SIGMA_S:
             start_s, end_s = imu_motion.time_s[[begin, end - 1]].tolist()

@@ -226,11 +226,23 @@ def tune_axes(
     See :func:`tune` for the parameters.
     """
     analysis_name = f"estimate of SIGMA_A and SIGMA_Z ({name})"
+    if settings.input != "imu":
+        flight = None
+    # All measurements, to classify outliers and to test KF's consistency
     preintegrated_motions = [preintegrate(axis, settings) for axis in axes]
     measurement_time_before_downsampling_s = axes[0].measurement_time_s[
         -len(preintegrated_motions[0].measurement_m) :
     ]
-    axes = tuple(axis.keep_rows(make_downsampling_slice(axis.measurement_time_s)) for axis in axes)
+    # Downsampled measurements, to fit the noises
+    kept = make_downsampling_slice(axes[0].measurement_time_s)
+    axes = tuple(
+        replace(
+            axis,
+            measurement_time_s=axis.measurement_time_s[kept],
+            measurement_m=axis.measurement_m[kept],
+        )
+        for axis in axes
+    )
     positions_by_axis = [
         convert_to_positions_and_increments(preintegrate(axis, settings)) for axis in axes
     ]
@@ -238,13 +250,15 @@ def tune_axes(
     if measurement_count < MIN_MEASUREMENTS:
         return report_too_few_measurements(analysis_name, measurement_count, MIN_MEASUREMENTS)
     current_parameters = NoiseParameters(settings.sigma_a_m_s2, settings.sigma_z_m)
+    # Two fits: kf_fit has the states of KF, so its SIGMA_A includes biases and tilt. imu_motion_fit
+    # also fits biases and tilt
     kf_fit = maximise_likelihood(positions_by_axis, current_parameters, np.ones(measurement_count))
     imu_motion_fit = None
-    if flight is not None and settings.input == "imu":
+    if flight is not None:
         imu_motion_fit = _fit_with_imu_motion(
             axes, settings, kf_fit, flight, may_drift, motion_cache
         )
-    best_fit = kf_fit if imu_motion_fit is None else imu_motion_fit
+    best_fit = imu_motion_fit or kf_fit
     outlier_probability = kf_fit.outlier_probability
     if len(measurement_time_before_downsampling_s) > measurement_count:
         # Also classify the measurements that downsampling omitted
@@ -266,7 +280,7 @@ def tune_axes(
     kf_sigma_a = sigma_a
     if imu_motion_fit is not None:
         kf_sigma_a = _estimate_kf_sigma_a(kf_fit, final_sigma_z_m)
-    elif flight is not None and settings.input == "imu":
+    elif flight is not None:
         # Without estimates of biases and tilt, KF's SIGMA_A is an upper bound of the noise
         sigma_a = NoiseEstimate(None, None, kf_sigma_a.high)
     final_parameters = NoiseParameters(
@@ -333,12 +347,9 @@ def _estimate_noises(fit: NoiseFit) -> tuple[NoiseEstimate, NoiseEstimate]:
         sigma_a, sigma_z = np.exp([tested_log_sigma_a, tested_log_sigma_z]).tolist()
         return fit.score(NoiseParameters(sigma_a, sigma_z, best_parameters.random_walk_m))
 
-    def score_with_sigma_z_first(tested_log_sigma_z: float, tested_log_sigma_a: float) -> float:
-        return score(tested_log_sigma_a, tested_log_sigma_z)
-
     sigma_a = _make_noise_estimate(score, (log_sigma_a, log_sigma_z), SIGMA_A_SEARCH_RANGE_M_S2)
     sigma_z = _make_noise_estimate(
-        score_with_sigma_z_first,
+        lambda tested_sigma_z, tested_sigma_a: score(tested_sigma_a, tested_sigma_z),
         (log_sigma_z, log_sigma_a),
         SIGMA_Z_SEARCH_RANGE_M,
         fit.variance_factor_of_ln_sigma_z,
@@ -347,10 +358,11 @@ def _estimate_noises(fit: NoiseFit) -> tuple[NoiseEstimate, NoiseEstimate]:
 
 
 def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z_m: float) -> NoiseEstimate:
-    low_log_sigma, high_log_sigma = np.log(SIGMA_A_SEARCH_RANGE_M_S2)
+    """Estimate SIGMA_A for KF with a given SIGMA_Z."""
 
+    # find_profile_likelihood_interval needs a second parameter. It has no effect here
     def score(log_sigma_a: float, _: float = 0.0) -> float:
-        sigma_a_m_s2 = float(np.exp(min(max(log_sigma_a, low_log_sigma), high_log_sigma)))
+        sigma_a_m_s2 = float(np.clip(np.exp(log_sigma_a), *SIGMA_A_SEARCH_RANGE_M_S2))
         return fit.score(NoiseParameters(sigma_a_m_s2, sigma_z_m))
 
     start = float(np.log(fit.noise_parameters.sigma_a_m_s2))
@@ -374,10 +386,8 @@ def _make_noise_estimate(
         < estimate
         < search_range[1] / SEARCH_RANGE_END_TOLERANCE_FACTOR
     )
-    has_both_ends = interval_low is not None and interval_high is not None
-    return NoiseEstimate(
-        estimate if is_inside and has_both_ends else None, interval_low, interval_high
-    )
+    is_known = is_inside and None not in (interval_low, interval_high)
+    return NoiseEstimate(estimate if is_known else None, interval_low, interval_high)
 
 
 def _assess_kf_consistency(
