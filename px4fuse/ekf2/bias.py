@@ -65,6 +65,7 @@ class BiasEstimator:
         represented_sample_count : float or ndarray, shape (filters,)
             Number of EKF2 samples that this sample represents.
         """
+        # 1. Prediction: the variance grows by the random walk since the previous sample
         is_bias_wrong = np.abs(self.mean_signed_test_ratio) > MAX_MEAN_TEST_RATIO_OF_VALID_BIAS
         bias_noise_m2_per_s = np.where(
             is_bias_wrong,
@@ -72,23 +73,27 @@ class BiasEstimator:
             POSITION_BIAS_NOISE_M_PER_SQRT_S**2,
         )
         bias_variance = np.minimum(self.variance_m2 + bias_noise_m2_per_s * interval_s, R_m2)
-        # The bias is state minus measurement: it is added to ν, and its own innovation is -ν
+        # 2. Correction of the measurement. The bias is state minus measurement, and ν is
+        # measurement minus state, so the bias is added to ν
         innovation_m = innovation_m + self.bias_m
         R = R_m2 + bias_variance
-        # The mean of n samples has 1/n of the variance of one sample; the bias is the same for all
+        # 3. Update of the bias. The bias filter measures state minus measurement: its innovation is
+        # -ν, and its measurement noise is that of ν. The mean of n samples has 1/n of the variance
+        # of one sample, but the bias is the same for all
+        bias_innovation_m = -innovation_m
         S = bias_variance + (R_m2 + predicted_variance) / represented_sample_count
-        test_ratio = innovation_m * innovation_m / (POSITION_BIAS_GATE**2 * S)
-        K = bias_variance / S * (is_bias_updated & (test_ratio < 1.0))
-        self.bias_m = self.bias_m - K * innovation_m
+        test_ratio = bias_innovation_m**2 / (POSITION_BIAS_GATE**2 * S)
+        is_fused = is_bias_updated & (test_ratio < 1.0)
+        K = is_fused * bias_variance / S
+        self.bias_m = self.bias_m + K * bias_innovation_m
         self.variance_m2 = np.maximum(
             bias_variance - K * bias_variance, MIN_POSITION_BIAS_VARIANCE_M2
         )
-        # EKF2 filters the test ratio with the sign of the bias innovation, which is opposite to ν
-        signed_test_ratio = np.copysign(np.minimum(test_ratio, 1.0), -innovation_m)
-        self.mean_signed_test_ratio = self.mean_signed_test_ratio + (
-            self.test_ratio_filter_weight
-            * represented_sample_count
-            * is_bias_updated
-            * (signed_test_ratio - self.mean_signed_test_ratio)
+        # 4. Low-pass filter of the test ratio with the sign of the innovation. n samples have n
+        # times the weight of one sample
+        signed_test_ratio = np.copysign(np.minimum(test_ratio, 1.0), bias_innovation_m)
+        filter_weight = is_bias_updated * self.test_ratio_filter_weight * represented_sample_count
+        self.mean_signed_test_ratio = self.mean_signed_test_ratio + filter_weight * (
+            signed_test_ratio - self.mean_signed_test_ratio
         )
         return innovation_m, R

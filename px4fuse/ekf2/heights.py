@@ -81,18 +81,20 @@ class BadAccelerationFlag:
         # A flag that is set at the start is set for the usual time
         self.until_s = self.since_s + flag_duration_s * float(logged_flag[0])
 
-    def compute_bad_acceleration_fraction(self, begin_s: Array, end_s: Array) -> Array:
-        """Return the fraction of a time interval with a bad acceleration, for each configuration.
+    def apply_logged_flag(self, now_s: Array) -> None:
+        """Set ``since_s`` and ``until_s`` to the latest logged time with a set flag before now.
 
-        Call this method in time order.
+        Only configurations that use the logged flag are changed.
         """
-        # Logged flags: the latest span that begins before the end of the interval
         if len(self.logged_spans_s):
-            last_row = np.searchsorted(self.logged_spans_s[:, 0], end_s) - 1
-            is_flag_from_log = self.uses_logged_flag & (last_row >= 0)
-            self.since_s[is_flag_from_log], self.until_s[is_flag_from_log] = self.logged_spans_s[
-                last_row[is_flag_from_log]
+            latest_row = np.searchsorted(self.logged_spans_s[:, 0], now_s) - 1
+            selected = self.uses_logged_flag & (latest_row >= 0)
+            self.since_s[selected], self.until_s[selected] = self.logged_spans_s[
+                latest_row[selected]
             ].T
+
+    def compute_bad_acceleration_fraction(self, begin_s: Array, end_s: Array) -> Array:
+        """Return the fraction of a time interval with a set flag, for each configuration."""
         if not (self.until_s > begin_s).any():
             return np.zeros_like(self.until_s)
         overlap_s = np.minimum(self.until_s, end_s) - np.maximum(self.since_s, begin_s)
