@@ -250,6 +250,7 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> ReplayAgreement | Un
         )
     agreement_by_axis, statistics = comparison
     agreement_by_aid, omitted_aids = _compare_other_aids(ekf2, replay, state_difference)
+    agreement_by_aid[aid.name] = agreement_by_axis
     # While EKF2 fuses only optical flow, position errors add up: the largest difference is compared
     flow_only_difference = _subtract_logged_state(
         replay, rows_inside(ekf2.state, replay.optical_flow_only_spans_s)
@@ -267,7 +268,10 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> ReplayAgreement | Un
                 f"(limit {MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
             )
     return ReplayAgreement(
-        **(agreement_by_aid | agreement_by_axis | {aid.name: agreement_by_axis} | statistics),
+        north=agreement_by_axis["north"],
+        east=agreement_by_axis["east"],
+        **agreement_by_aid,  # ev_pos, gnss_pos, gnss_vel, and so on
+        **statistics,  # samples to decisions_same, good and reason
         doubtful=omitted_aids,
         published_rms_difference_m=math.hypot(
             *(axis.position_rms_difference_m for axis in agreement_by_axis.values())
@@ -289,6 +293,7 @@ def _compare_innovations(
     Return the agreement by axis, and fields of :class:`ReplayAgreement` for all axes together; or
     the reason why the innovations cannot be compared.
     """
+    # 1. Pairs of logged and replayed innovations in the evaluated time, row by row
     update_rows = match_updates(
         replayed_innovations,
         logged_innovations.index.to_numpy(),
@@ -303,27 +308,30 @@ def _compare_innovations(
     is_used &= logged_innovations[columns].any(axis=1)
     logged_innovations = logged_innovations[is_used]
     replayed_innovations = replayed_innovations.iloc[update_rows[is_used]]
+    # 2. Reasons against a comparison
     if len(logged_innovations) < MIN_COMPARED_INNOVATIONS:
         return (
             f"the log contains only {format_count(len(logged_innovations), 'innovation')} in the "
             f"replayed time (at least {MIN_COMPARED_INNOVATIONS} are needed)"
         )
-    compared_innovations = (logged_innovations, replayed_innovations)
-    if not all(np.ptp(innovations[columns], axis=0).all() for innovations in compared_innovations):
-        return CONSTANT_INNOVATIONS_REASON
-    is_rejected = np.array([innovations["rejected"] > 0.0 for innovations in compared_innovations])
+    # A constant innovation has no correlation
+    for innovations in (logged_innovations, replayed_innovations):
+        if not np.ptp(innovations[columns], axis=0).all():
+            return CONSTANT_INNOVATIONS_REASON
+    # 3. Comparison
     agreement_by_axis: dict[str, AxisAgreement] = {
-        axis: _compare_axis(axis, *compared_innovations, state_difference) for axis in axes
+        axis: _compare_axis(axis, logged_innovations, replayed_innovations, state_difference)
+        for axis in axes
     }
-    logged_rejected_fraction, replayed_rejected_fraction = is_rejected.mean(axis=1).tolist()
-    is_in_agreement, reason = _judge_agreement(
-        agreement_by_axis, logged_rejected_fraction, replayed_rejected_fraction
-    )
+    is_rejected_logged = logged_innovations["rejected"].to_numpy() > 0.0
+    is_rejected_replayed = replayed_innovations["rejected"].to_numpy() > 0.0
+    rejected_fractions = float(is_rejected_logged.mean()), float(is_rejected_replayed.mean())
+    is_in_agreement, reason = _judge_agreement(agreement_by_axis, *rejected_fractions)
     return agreement_by_axis, {
         "samples": len(logged_innovations),
-        "rejected_fraction_logged": logged_rejected_fraction,
-        "rejected_fraction_replayed": replayed_rejected_fraction,
-        "decisions_same": float(np.mean(np.equal(*is_rejected))),
+        "rejected_fraction_logged": rejected_fractions[0],
+        "rejected_fraction_replayed": rejected_fractions[1],
+        "decisions_same": float(np.mean(is_rejected_logged == is_rejected_replayed)),
         "good": is_in_agreement,
         "reason": reason,
     }
@@ -342,6 +350,11 @@ def _subtract_logged_state(replay: Ekf2Replay, logged_state: pd.DataFrame) -> pd
 
 
 def _compute_heading_difference_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
+    """Return the RMS difference (°) of replayed and logged heading.
+
+    Return None if the replay does not estimate the heading: it then uses the logged heading.
+    """
+    # The settings contain magnetometer parameters only if the replay fuses the magnetometer
     if MAG.noise not in replay.settings or isinstance(ekf2.record, Unavailable):
         return None
     logged_state = rows_inside(ekf2.record.delayed_state, replay.find_evaluated_spans())
@@ -362,7 +375,7 @@ def _compare_other_aids(
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """Compare innovations of all aiding sources except the position source with the log.
 
-    Return the agreement of each source, and the reasons for disagreement.
+    Return the agreement of each source by axis, and the reasons to omit a source from the replay.
     """
     agreement_by_aid: dict[str, Any] = {}
     omitted_aids = {}
@@ -379,15 +392,16 @@ def _compare_other_aids(
             innovation_topic(AIDS[name]) in aid_log.topics,
             state_difference,
         )
-        # GNSS velocity is omitted only if its innovations are constant, as those of a frozen sensor
-        may_disagree = name == GNSS_VEL.name
+        reason = ""
         if isinstance(comparison, str):
-            if not may_disagree or comparison == CONSTANT_INNOVATIONS_REASON:
-                omitted_aids[name] = comparison
-            continue
-        agreement_by_aid[name], statistics = comparison
-        if not (statistics["good"] or may_disagree):
-            omitted_aids[name] = statistics["reason"]
+            reason = comparison
+        else:
+            agreement_by_aid[name], statistics = comparison
+            if not statistics["good"]:
+                reason = statistics["reason"]
+        # GNSS velocity is omitted only if its innovations are constant, as those of a frozen sensor
+        if reason and (name != GNSS_VEL.name or reason == CONSTANT_INNOVATIONS_REASON):
+            omitted_aids[name] = reason
     return agreement_by_aid, omitted_aids
 
 
@@ -412,12 +426,14 @@ def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
 def _join_axis_innovations(
     innovations: Mapping[NedAxis, pd.DataFrame | Unavailable],
 ) -> pd.DataFrame:
+    """Return one table with the innovations of all axes; empty if an axis is not logged."""
     columns = {}
     for axis, axis_innovations in innovations.items():
         if isinstance(axis_innovations, Unavailable):
             return pd.DataFrame()
         columns[f"innovation_{axis}_m"] = axis_innovations["innovation_m"]
         columns[f"innovation_variance_{axis}_m2"] = axis_innovations["innovation_variance_m2"]
+        # EKF2 rejects all axes of a sample together, so the flag of any axis is sufficient
         columns["rejected"] = axis_innovations["rejected"]
     return pd.DataFrame(columns).dropna()
 
@@ -445,17 +461,18 @@ def match_updates(
     """
     if has_measurement_times:
         return find_matching_samples(updates.index.to_numpy(), logged_times_s)
+    # The log contains EKF2's innovations at the logging times: those of the latest update. 0.1 ms
+    # allows for rounding errors of times
     fusion_times_s = updates["fused_at_s"].to_numpy()
     update_rows = np.searchsorted(fusion_times_s, logged_times_s + 1e-4, side="right") - 1
     age_s = logged_times_s - fusion_times_s[np.maximum(update_rows, 0)]
     is_matched = (update_rows >= 0) & (age_s <= MAX_INNOVATION_AGE_S)
-    # A log row in the same prediction step as a fusion may still contain the previous innovation
+    # A log row in the same prediction step as a fusion may still contain the previous innovation.
+    # Such rows are omitted, unless they are most rows: then EKF2 logs right after each fusion
     is_unambiguous = is_matched & (age_s >= SAME_STEP_TOLERANCE_S)
-    return np.where(
-        is_unambiguous if is_unambiguous.sum() > 0.5 * is_matched.sum() else is_matched,
-        update_rows,
-        -1,
-    )
+    if is_unambiguous.sum() > 0.5 * is_matched.sum():
+        is_matched = is_unambiguous
+    return np.where(is_matched, update_rows, -1)
 
 
 def _compare_axis(
@@ -516,7 +533,13 @@ def _judge_agreement(
     tolerance_factor: float = 1.0,
     min_allowed_correlation: float = MIN_INNOVATION_CORRELATION,
 ) -> tuple[bool, str]:
-    """Return True if the replay agrees with the log, and the statistics as a text."""
+    """Return True if the replay agrees with the log, and the statistics as a text.
+
+    1. The innovation variances must agree, because they hardly depend on single rejections.
+    2. If the innovations are correlated enough, the positions must agree.
+    3. If not, and few samples are rejected, the replay does not agree. With many rejections,
+       rejected fraction and mean NIS must agree: a different rejection changes later innovations.
+    """
     variance_ratios = (axis.s_ratio_median for axis in axes.values())
     worst_variance_ratio = max(variance_ratios, key=lambda s_ratio: abs(s_ratio - 1.0))
     if abs(worst_variance_ratio - 1.0) > MAX_INNOVATION_VARIANCE_RATIO_DEVIATION:
@@ -526,6 +549,7 @@ def _judge_agreement(
             f"(limit 1 ± {MAX_INNOVATION_VARIANCE_RATIO_DEVIATION:.2f}): "
             "EKF2 fused samples that are not in the log"
         )
+    # 2. Innovations and positions
     min_correlation = min(axis.innovation_correlation for axis in axes.values())
     correlation_text = (
         f"replayed and logged innovations have a correlation of {min_correlation:.4f}"
@@ -540,6 +564,7 @@ def _judge_agreement(
                 f"(limit {max_difference_m:g} m): the log lacks data of EKF2's output predictor"
             )
         return True, correlation_text
+    # 3. Rejections
     if (
         max(rejected_fraction_logged, rejected_fraction_replayed)
         < MAX_REJECTED_FRACTION_FOR_COMPARISON
