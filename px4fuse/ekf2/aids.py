@@ -340,8 +340,10 @@ def _find_applied_gate(aid: Aid, aid_log: AidLog) -> float:
 def _find_noise_origin(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> str:
     """Return the origin of R: a parameter name, or a text such as "reported accuracy"."""
     parameter_value = aid_log.parameters.get(aid.noise)
-    if noise_sigma is None or parameter_value is None:
-        return "" if noise_sigma is None else aid.noise_source_text
+    if noise_sigma is None:
+        return ""
+    if parameter_value is None:
+        return aid.noise_source_text
     # The parameter is σ, σ without a factor (GNSS height), or a variance (EKF2_DRAG_NOISE)
     possible_sigmas = (
         parameter_value,

@@ -102,7 +102,8 @@ def _compute_bias_over_time(bias_updates: pd.DataFrame, interval_s: float) -> pd
     bias_change_m = _compute_bias_gain(bias_updates) * bias_updates["innovation_m"]
     bias_m = bias_updates["bias_m"]
     bias_after_update_m = bias_m.set_axis(bias_m.index + 0.5 * interval_s)
-    return pd.concat([bias_m - bias_change_m.fillna(0.0), bias_after_update_m]).sort_index()
+    changes = pd.concat([bias_m - bias_change_m.fillna(0.0), bias_after_update_m])
+    return pd.Series(changes).sort_index()
 
 
 def _make_measurement_prediction(
@@ -125,7 +126,7 @@ def _make_measurement_prediction(
     )
 
     def predict_measured_down_m(time_s: Array) -> Array:
-        return (
+        return np.asarray(
             np.interp(time_s, updates.index, height_minus_displacement_m)
             + np.interp(time_s, velocity_times_s, displacement_m)
             - np.interp(time_s, bias_m.index, bias_m)

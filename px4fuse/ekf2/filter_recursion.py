@@ -20,6 +20,7 @@ from px4fuse.core.arrays import Array, Array32, ArrayPair, BoolArray, IntArray
 from px4fuse.flight.ekf2_parameters import FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
 
 from .filter_batch import FilterBatch, FilterConfiguration
+from .height_samples import POSITION_DOWN
 from .heights import (
     GNSS_HEIGHT_NOISE_FACTOR,
     MIN_INNOVATION_GATE,
@@ -48,6 +49,7 @@ from .replay_segments import (
     EARTH_MAGNETIC_FIELD,
     GRAVITY_M_S2,
     GYRO_BIAS,
+    HORIZONTAL_POSITION,
     MOTION_STATE_COUNT,
     STATE_COUNT,
     THETA,
@@ -77,11 +79,10 @@ MAX_BIAS_SIGMA_M_S2 = 0.1 * GRAVITY_MAGNITUDE_M_S2
 MIN_RATIO_TO_LARGEST_BIAS_VARIANCE = 0.01
 # State indices of the attitude error
 TILT_ABOUT_NORTH, TILT_ABOUT_EAST, HEADING = 0, 1, 2
-# State indices of the position
-POSITION_NORTH, POSITION_EAST, POSITION_DOWN = 6, 7, 8
+# State indices of the horizontal position
+POSITION_NORTH, POSITION_EAST = 6, 7
 # State indices of the accelerometer bias
 ACCELEROMETER_BIAS_NORTH, ACCELEROMETER_BIAS_EAST, ACCELEROMETER_BIAS_DOWN = 12, 13, 14
-HORIZONTAL_POSITION = slice(POSITION_NORTH, POSITION_EAST + 1)
 # State indices of velocity and position
 VELOCITY_AND_POSITION = slice(3, 9)
 # Columns in measurements of velocity (0 to 2) and position (3 to 5), NED
@@ -162,13 +163,20 @@ def run_segment(  # noqa: PLR0912 (the order of EKF2's fusions in one place)
     ]
     height_filter = vision_filter = None
     if segment.height_samples is not None:
-        height_filter = HeightFilter(batch, positions.has_action, bad_acceleration_flag)
+        height_filter = HeightFilter(
+            batch,
+            positions.has_action,
+            positions.measured_values[..., DOWN_COLUMN],
+            positions.measurement_variance[..., DOWN_COLUMN],
+            bad_acceleration_flag,
+        )
     if inputs.vision_positions is not None:
         vision_filter = VisionFilter(batch)
     x, P = _make_start_state(batch, bad_acceleration_flag)
     event_count, configuration_count = batch.events.shape
-    magnetometer_event_count = event_count if segment.magnetic_field else 0
-    magnetometer_updates = np.full((magnetometer_event_count, 3, configuration_count, 3), np.nan)
+    magnetometer_updates = np.full(
+        (event_count if segment.magnetic_field else 0, 3, configuration_count, 3), np.nan
+    )
     states = np.empty((event_count + 1, *x.shape))
     state_variances = np.empty(states.shape, np.float32)
     states[0], state_variances[0] = x, _get_state_variances(P)
@@ -191,13 +199,7 @@ def run_segment(  # noqa: PLR0912 (the order of EKF2's fusions in one place)
         if positions.has_sample[event]:
             x, P = positions.test_and_fuse_gnss(event, x, P)
         if height_filter is not None:
-            x, P = height_filter.fuse_gnss(
-                event,
-                x,
-                P,
-                positions.measured_values[event, :, DOWN_COLUMN],
-                positions.measurement_variance[event, :, DOWN_COLUMN],
-            )
+            x, P = height_filter.fuse_gnss(event, x, P)
         # 5. Vision as the only position source; logged height and heading
         x, P = positions.fuse_vision_and_logged_states(event, x, P)
         # 6. Reset to the sample of the position source
@@ -346,19 +348,19 @@ def _compute_bias_noise(batch: FilterBatch) -> ArrayPair:
     adds no process noise to a state whose variance exceeds the maximum.
     """
     process_noise, max_variance = np.zeros((2, len(batch.configurations), len(batch.segment.state)))
-    sensors_and_states = [
-        ("GYR_B", "GYR", GYRO_BIAS, batch.estimates_attitude),
-        ("ACC_B", "ACC", ACCELEROMETER_BIAS, batch.estimates_biases),
-    ]
+    sensors_and_states = [("GYR_B", "GYR", GYRO_BIAS), ("ACC_B", "ACC", ACCELEROMETER_BIAS)]
     if batch.segment.magnetic_field is not None:
         sensors_and_states += [
-            ("MAG_E", "MAG", EARTH_MAGNETIC_FIELD, True),
-            ("MAG_B", "MAG", BODY_MAGNETIC_FIELD, True),
+            ("MAG_E", "MAG", EARTH_MAGNETIC_FIELD),
+            ("MAG_B", "MAG", BODY_MAGNETIC_FIELD),
         ]
-    for bias_name, sensor_name, states, is_estimated in sensors_and_states:
-        noise_density = is_estimated * batch.parameters[f"EKF2_{bias_name}_NOISE"]
+    for bias_name, sensor_name, states in sensors_and_states:
+        noise_density = batch.parameters[f"EKF2_{bias_name}_NOISE"]
         process_noise[:, states] = (noise_density * batch.inputs.mean_step_s)[:, None] ** 2
         max_variance[:, states] = batch.parameters[f"EKF2_{sensor_name}_NOISE"][:, None] ** 2
+    # States that a filter does not estimate are constant
+    process_noise[~batch.estimates_attitude, GYRO_BIAS] = 0.0
+    process_noise[~batch.estimates_biases, ACCELEROMETER_BIAS] = 0.0
     return process_noise, max_variance
 
 

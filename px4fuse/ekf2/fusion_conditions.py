@@ -279,24 +279,25 @@ def _check_position_quality(positions: UnfusedPositions) -> Iterator[UnmetCondit
     if min_quality <= 0.0 or "quality" not in status:
         return
     quality = positions.select_samples(status)["quality"]
-    # EKF2 also checks the quality of the previous sample and of the newest sample
+    # EKF2 starts fusion if all samples from the fused (delayed) to the newest, and the sample
+    # before, have the minimum quality. A shorter span without fusion needs all of its samples
     sample_count = int(np.ceil(positions.max_sample_age_s / positions.interval_s)) + 2
     has_min_quality = (quality >= min_quality).astype(float)
-    if has_min_quality.rolling(min(sample_count, max(len(quality), 1))).min().max() == 1.0:
+    have_all_min_quality = has_min_quality.rolling(min(sample_count, max(len(quality), 1))).min()
+    if (have_all_min_quality == 1.0).any():
         return
     median_quality = float(quality.median())
     reason = (
         f"{100.0 * (1.0 - has_min_quality.mean()):.0f} % of {len(quality)} positions have a "
         "quality below EKF2_EV_QMIN."
     )
-    action = (
-        "Improve light and texture in the camera view, or fly slower. Set EKF2_EV_QMIN to "
-        f"{max(median_quality, 0.0):.0f} only if the positions are correct."
-    )
-    if not quality.any():
-        reason = (
-            f"{reason} MAVLink VISION_POSITION_ESTIMATE contains no quality, so EKF2 assumes 0."
+    if quality.any():
+        action = (
+            "Improve light and texture in the camera view, or fly slower. Set EKF2_EV_QMIN to "
+            f"{max(median_quality, 0.0):.0f} only if the positions are correct."
         )
+    else:
+        reason += " MAVLink VISION_POSITION_ESTIMATE contains no quality, so EKF2 assumes 0."
         action = "Send the quality field of MAVLink ODOMETRY, or set EKF2_EV_QMIN to 0."
     fault = f"the quality is {median_quality:.0f}, below EKF2_EV_QMIN {min_quality:.0f}"
     yield UnmetCondition("quality", fault, reason, action)
