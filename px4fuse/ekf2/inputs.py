@@ -216,7 +216,7 @@ class ReplayInputs:
     vision_positions: ReceivedPositions | None = None
 
 
-def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
+def prepare_inputs(  # noqa: PLR0911, PLR0912, PLR0915 (one return per reason)
     flight: Flight, omitted_aids: Mapping[str, str] = {}
 ) -> ReplayInputs | Unavailable:
     """Return the inputs of the EKF2 replay, or the reason why the log is insufficient.
@@ -289,20 +289,30 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
             "Record without dropouts (faster SD card, fewer topics) and send positions at a "
             "constant rate.",
         )
-    reason_to_use_logged_height = ""
-    if is_gnss:
-        segments, reason_to_use_logged_height = _add_flow_and_heights(
-            flight, ekf2, fusion_record, segments, omitted_aids
-        )
+    if len(flow_samples):
+        flow_gate = fusion_record.parameters.get(FLOW.gate, FLOW.default_gate)
+        segments = tuple(add_flow_samples(segment, flow_samples, flow_gate) for segment in segments)
+    reason_to_use_logged_height = "; ".join(
+        f"{AIDS[name].label}: {reason}"
+        for name, reason in omitted_aids.items()
+        if name not in (FLOW.name, EV_POS.name)
+    )
+    if is_gnss and not reason_to_use_logged_height:
+        segments_with_heights = add_heights(flight, ekf2, fusion_record, segments)
+        if isinstance(segments_with_heights, str):
+            reason_to_use_logged_height = segments_with_heights
+        else:
+            segments = segments_with_heights
     # 4. Parameters of the fused aiding sources
+    fused_aids = [aid]
+    if vision_positions is not None:
+        fused_aids.append(EV_POS)
+    if any(segment.magnetic_field for segment in segments):
+        fused_aids.append(MAG)
     height_samples = segments[0].height_samples
-    is_other_aid_fused = {
-        EV_POS: vision_positions is not None,
-        MAG: any(segment.magnetic_field for segment in segments),
-        BAROMETER: height_samples and BAROMETER.name in height_samples.fused_sensors,
-    }
-    other_aids = [other_aid for other_aid, is_fused in is_other_aid_fused.items() if is_fused]
-    settings = fill_parameters_with_defaults(fusion_record.parameters, aid, *other_aids)
+    if height_samples and BAROMETER.name in height_samples.fused_sensors:
+        fused_aids.append(BAROMETER)
+    settings = fill_parameters_with_defaults(fusion_record.parameters, *fused_aids)
     if is_gnss and (gnss_track := _find_gnss_track(flight)):
         # Since PX4 v1.17, GNSS messages contain the lever arm of the receiver
         settings |= dict(zip(aid.lever_arm, gnss_track.lever_arm_m, strict=True))
@@ -327,30 +337,6 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         reason_to_use_logged_height=reason_to_use_logged_height,
         vision_positions=vision_positions,
     )
-
-
-def _add_flow_and_heights(
-    flight: Flight,
-    ekf2: Ekf2,
-    fusion_record: FusionRecord,
-    segments: tuple[ReplaySegment, ...],
-    omitted_aids: Mapping[str, str],
-) -> tuple[tuple[ReplaySegment, ...], str]:
-    """Add optical flow and heights; also return the reason if heights cannot be added, or ""."""
-    if len(flow_samples := fusion_record.flow):
-        gate = fusion_record.parameters.get(FLOW.gate, FLOW.default_gate)
-        segments = tuple(add_flow_samples(segment, flow_samples, gate) for segment in segments)
-    reason_to_use_logged_height = "; ".join(
-        f"{AIDS[name].label}: {reason}"
-        for name, reason in omitted_aids.items()
-        if name not in (FLOW.name, EV_POS.name)
-    )
-    if reason_to_use_logged_height:
-        return segments, reason_to_use_logged_height
-    segments_with_heights = add_heights(flight, ekf2, fusion_record, segments)
-    if isinstance(segments_with_heights, str):
-        return segments, segments_with_heights
-    return segments_with_heights, ""
 
 
 def _explain_unmodelled_aids(

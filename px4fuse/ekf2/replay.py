@@ -225,8 +225,8 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> ReplayAgreement | Un
     """Compare an EKF2 replay with the logged innovations and states."""
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    state_difference = _subtract_logged_state(
-        replay, rows_inside(ekf2.state, replay.find_evaluated_spans())
+    state_difference = subtract_states(
+        replay.published_state, rows_inside(ekf2.state, replay.find_evaluated_spans())
     )
     if state_difference.empty:
         return Unavailable(
@@ -252,8 +252,8 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> ReplayAgreement | Un
     agreement_by_aid, omitted_aids = _compare_other_aids(ekf2, replay, state_difference)
     agreement_by_aid[aid.name] = agreement_by_axis
     # While EKF2 fuses only optical flow, position errors add up: the largest difference is compared
-    flow_only_difference = _subtract_logged_state(
-        replay, rows_inside(ekf2.state, replay.optical_flow_only_spans_s)
+    flow_only_difference = subtract_states(
+        replay.published_state, rows_inside(ekf2.state, replay.optical_flow_only_spans_s)
     )
     flow_position_difference_m = None
     if len(flow_only_difference):
@@ -337,13 +337,11 @@ def _compare_innovations(
     }
 
 
-def _subtract_logged_state(replay: Ekf2Replay, logged_state: pd.DataFrame) -> pd.DataFrame:
-    """Return the replayed minus the logged state, at the times of the logged state."""
-    published_state = replay.published_state
+def subtract_states(state: pd.DataFrame, reference: pd.DataFrame) -> pd.DataFrame:
+    """Return a state minus a reference state, at the times of the reference."""
     return pd.DataFrame(
         {
-            name: np.interp(logged_state.index, published_state.index, published_state[name])
-            - logged_state[name]
+            name: np.interp(reference.index, state.index, state[name]) - reference[name]
             for name in Columns.STATE
         }
     )

@@ -39,6 +39,7 @@ from .replay import (
     interpolate_component,
     is_inside_spans,
     rows_inside,
+    subtract_states,
 )
 
 DIFFERENCE_ANALYSIS_NAME = "difference KF - EKF2"
@@ -411,19 +412,12 @@ def _find_longest_rejection(
     begin_s = fusion_times_s[run_starts[longest_index]]
     # The last series may continue to the end of the flight
     end_s = fusion_times_s[min(run_ends[longest_index], len(fusion_times_s) - 1)]
-    fusion_horizon_track = baseline_replay.delayed_state.loc[begin_s:end_s]
-    position_difference = [
-        fusion_horizon_track[column]
-        - np.interp(
-            fusion_horizon_track.index,
-            fusion_horizon_track_without_gate.index,
-            fusion_horizon_track_without_gate[column],
-        )
-        for column in Columns.POSITION[:2]
-    ]
+    difference = subtract_states(
+        fusion_horizon_track_without_gate, baseline_replay.delayed_state.loc[begin_s:end_s]
+    )
     return RejectionSeries(
         start_s=float(begin_s),
         samples=int(run_ends[longest_index] - run_starts[longest_index]),
         duration_s=float(end_s - begin_s),
-        distance_m=float(np.max(np.hypot(*position_difference))),
+        distance_m=float(np.hypot(difference["north_m"], difference["east_m"]).max()),
     )
