@@ -81,7 +81,7 @@ def fusing(
         parameters={"EKF2_BARO_NOISE": np.array([0.5]), "EKF2_BARO_GATE": np.array([5.0])},
     )  # fmt: skip
     flag = BadAccelerationFlag(np.array([True]), 3.0, segment)
-    return HeightFilter(batch, has_fix, np.zeros_like(time_s), np.ones_like(time_s), flag)
+    return HeightFilter(batch, has_fix, np.zeros_like(time_s), flag)
 
 
 def standing(of: HeightSamples, count: int = 400, **how: Any) -> tuple[HeightFilter, pd.DataFrame]:

@@ -8,7 +8,7 @@ Source: PX4-Autopilot ``EKF/bias_estimator`` (``bias_estimator.cpp``; before v1.
 
 import numpy as np
 
-from px4fuse.core.arrays import Array, BoolArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray
 
 # Noise density (m/√s) of the random walk of a height or vision bias (bias_nsd, common.h)
 POSITION_BIAS_NOISE_M_PER_SQRT_S = 0.13
@@ -53,7 +53,7 @@ class BiasEstimator:
         interval_s: Array,
         is_bias_updated: BoolArray,
         represented_sample_count: Array | float = 1.0,
-    ) -> tuple[Array, Array]:
+    ) -> ArrayPair:
         """Correct a measurement for the bias, and update the bias; return innovation and R.
 
         Parameters

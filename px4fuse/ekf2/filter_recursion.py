@@ -167,7 +167,6 @@ def run_segment(  # noqa: PLR0912 (the order of EKF2's fusions in one place)
             batch,
             positions.has_action,
             positions.measured_values[..., DOWN_COLUMN],
-            positions.measurement_variance[..., DOWN_COLUMN],
             bad_acceleration_flag,
         )
     if inputs.vision_positions is not None:
@@ -199,7 +198,8 @@ def run_segment(  # noqa: PLR0912 (the order of EKF2's fusions in one place)
         if positions.has_sample[event]:
             x, P = positions.test_and_fuse_gnss(event, x, P)
         if height_filter is not None:
-            x, P = height_filter.fuse_gnss(event, x, P)
+            gnss_variance_m2 = positions.measurement_variance[event, :, DOWN_COLUMN]
+            x, P = height_filter.fuse_gnss(event, x, P, gnss_variance_m2)
         # 5. Vision as the only position source; logged height and heading
         x, P = positions.fuse_vision_and_logged_states(event, x, P)
         # 6. Reset to the sample of the position source
@@ -513,7 +513,10 @@ class _PositionFusion:
 
 
 def _average_samples(batch: FilterBatch, aid: Aid, samples: SensorSamples) -> EventSamples:
-    """Return the mean magnetometer or optical flow samples, shape (events, filters)."""
+    """Return the mean magnetometer or optical flow samples, shape (events, filters).
+
+    The events of each filter are a column of ``batch.event_steps``.
+    """
     mean_samples = EventSamples(
         *_stack_by_filter(
             [average_by_event(batch.segment, samples, steps) for steps in batch.event_steps.T]

@@ -156,8 +156,8 @@ class HeightFilter:
 
     Parameters
     ----------
-    has_gnss_fix, gnss_down_m, gnss_variance_m2 : ndarray, shape (events, filters)
-        True for a GNSS fix; its height (positive down), and R.
+    has_gnss_fix, gnss_down_m : ndarray, shape (events, filters)
+        True for a GNSS fix, and its height (positive down).
 
     Attributes
     ----------
@@ -176,7 +176,6 @@ class HeightFilter:
         batch: FilterBatch,
         has_gnss_fix: BoolArray,
         gnss_down_m: Array,
-        gnss_variance_m2: Array,
         bad_acceleration_flag: BadAccelerationFlag,
     ) -> None:
         self.bad_acceleration_flag = bad_acceleration_flag
@@ -205,7 +204,6 @@ class HeightFilter:
             barometer_samples, ((0, 0), (0, 1), (0, 0), (0, 0))
         )
         self.down_m[-1], self.time_s[-1] = gnss_down_m, batch.events["time_s"]
-        self.gnss_variance_m2 = gnss_variance_m2
         # GNSS samples and padding have the weight 1
         self.weight = np.maximum(weight, 1.0)
         self.has_sample = (has_sample > 0.0) & batch.is_enabled_by_aid[BAROMETER.name]
@@ -255,8 +253,7 @@ class HeightFilter:
             x, P = self._fuse_sample(BAROMETER, event, sample_index, x, P, self.R_m2)
         return x, P
 
-    def fuse_gnss(self, event: int, x: Array, P: Array) -> ArrayPair:
-        R = self.gnss_variance_m2[event]
+    def fuse_gnss(self, event: int, x: Array, P: Array, R: Array) -> ArrayPair:
         return self._fuse_sample(GNSS_HGT, event, self.gnss_index, x, P, R)
 
     def update_bad_acceleration_flag(
@@ -272,10 +269,10 @@ class HeightFilter:
         # ν / √S, positive upwards. ν and S are the first two rows of a record
         innovations = -records[:, :, 0] / np.sqrt(records[:, :, 1])
         if (innovations > MIN_HEIGHT_INNOVATION_SIGMAS_OF_ONE_SENSOR).any():
-            *barometer, gnss_height, gnss_velocity = np.moveaxis(innovations, 1, 0)
-            # EKF2 uses the larger innovation of GNSS; a missing one is NaN
-            innovations = np.stack([*barometer, np.fmax(gnss_height, gnss_velocity)], axis=1)
-            self.bad_acceleration_flag.update(time_s, *innovations)
+            # The last two columns are GNSS height and GNSS velocity. EKF2 uses the larger
+            # innovation; a missing one is NaN
+            innovations[:, -2] = np.fmax(innovations[:, -2], innovations[:, -1])
+            self.bad_acceleration_flag.update(time_s, *innovations[:, :-1])
 
     def _fuse_sample(
         self, aid: Aid, event: int, sample_index: int, x: Array, P: Array, R: Array

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.core.arrays import Array, BoolArray, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.trajectory.rotation import rotate, skew
 
 from .inputs import ReplayInputs
@@ -299,7 +299,7 @@ def _integrate_state_derivatives(
 
 def _compute_imu_process_noise(
     prediction_step_counts: Array, duration_s: Array, velocity_derivative_by_attitude: Array
-) -> tuple[Array, Array]:
+) -> ArrayPair:
     """Return the process noise for unit gyro noise, and for unit accelerometer noise.
 
     The specific force is assumed to be constant in an interval of n steps of length d. In one step,

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.linalg import lapack
 
-from px4fuse.core.arrays import Array
+from px4fuse.core.arrays import Array, ArrayPair
 from px4fuse.trajectory.rotation import rotate
 
 from .replay_segments import (
@@ -38,7 +38,7 @@ def compute_published_state(
     published_minus_nominal_attitude_rad: Array,
     lag_steps: int,
     settings: Mapping[str, float],
-) -> tuple[Array, Array]:
+) -> ArrayPair:
     """Return the published velocity (m/s) and position (m) after each of n prediction steps.
 
     Parameters
@@ -122,7 +122,7 @@ def sum_attitude_corrections(
     ``error_rad``, shape (n + 1, 3), is the attitude error at the fusion horizon.
 
     Each step corrects the newest attitude by a fraction g of the error at the fusion horizon, of
-    which the corrections c up to that time are already removed. With the lag L + 1 in steps:
+    which the corrections c up to that time are already removed. With L = ``lag_steps``:
 
         c_k - c_(k-1) + g c_(k-L-1) = g error_(k-L-1)
     """

@@ -268,8 +268,7 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> ReplayAgreement | Un
                 f"(limit {MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
             )
     return ReplayAgreement(
-        north=agreement_by_axis["north"],
-        east=agreement_by_axis["east"],
+        **agreement_by_axis,  # north and east
         **agreement_by_aid,  # ev_pos, gnss_pos, gnss_vel, and so on
         **statistics,  # samples to decisions_same, good and reason
         doubtful=omitted_aids,
@@ -287,11 +286,11 @@ def _compare_innovations(
     logged_innovations: pd.DataFrame,
     has_measurement_times: bool,
     state_difference: pd.DataFrame,
-) -> tuple[dict[str, AxisAgreement], dict[str, Any]] | str:
+) -> tuple[dict[str, Any], dict[str, Any]] | str:
     """Compare replayed with logged innovations.
 
-    Return the agreement by axis, and fields of :class:`ReplayAgreement` for all axes together; or
-    the reason why the innovations cannot be compared.
+    Return :class:`AxisAgreement` by axis, and fields of :class:`ReplayAgreement` for all axes
+    together; or the reason why the innovations cannot be compared.
     """
     # 1. Pairs of logged and replayed innovations in the evaluated time, row by row
     update_rows = match_updates(
@@ -319,7 +318,7 @@ def _compare_innovations(
         if not np.ptp(innovations[columns], axis=0).all():
             return CONSTANT_INNOVATIONS_REASON
     # 3. Comparison
-    agreement_by_axis: dict[str, AxisAgreement] = {
+    agreement_by_axis: dict[str, Any] = {
         axis: _compare_axis(axis, logged_innovations, replayed_innovations, state_difference)
         for axis in axes
     }
@@ -431,7 +430,7 @@ def _join_axis_innovations(
             return pd.DataFrame()
         columns[f"innovation_{axis}_m"] = axis_innovations["innovation_m"]
         columns[f"innovation_variance_{axis}_m2"] = axis_innovations["innovation_variance_m2"]
-        # EKF2 rejects all axes of a sample together, so the flag of any axis is sufficient
+        # The flag is the same for all axes of a sample
         columns["rejected"] = axis_innovations["rejected"]
     return pd.DataFrame(columns).dropna()
 
@@ -466,7 +465,7 @@ def match_updates(
     age_s = logged_times_s - fusion_times_s[np.maximum(update_rows, 0)]
     is_matched = (update_rows >= 0) & (age_s <= MAX_INNOVATION_AGE_S)
     # A log row in the same prediction step as a fusion may still contain the previous innovation.
-    # Such rows are omitted, unless they are most rows: then EKF2 logs right after each fusion
+    # Such rows are omitted, unless most rows are written in the prediction step of the fusion
     is_unambiguous = is_matched & (age_s >= SAME_STEP_TOLERANCE_S)
     if is_unambiguous.sum() > 0.5 * is_matched.sum():
         is_matched = is_unambiguous

@@ -211,7 +211,7 @@ class VisionFilter:
             )
             is_restarting = (has_sample & must_restart) | is_rejection_timed_out
             # A restart resets the position if vision is the only position source, or if EKF2 has
-            # rejected GNSS, too. Otherwise, it sets the vision bias
+            # fused neither vision nor GNSS for a time. Otherwise, it sets the vision bias
             is_gnss_timed_out = fusion_time_s - last_gnss_fusion_s > MAX_REJECTION_DURATION_S
             is_position_reset = is_restarting & (
                 is_gnss_off | (is_rejection_timed_out & is_gnss_timed_out)

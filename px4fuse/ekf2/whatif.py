@@ -457,7 +457,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf2St
         spans_s,
         evaluated_updates,
         ekf2.state,
-        None,
+        None,  # σ from the logged position variance
         other_aid_updates,
         headings_rad,
         changed={},
