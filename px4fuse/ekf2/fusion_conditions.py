@@ -357,27 +357,27 @@ def _check_gnss(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     parameters = positions.parameters
     # Bit n of EKF2_GPS_CHECK enables check n + 1 of GNSS_CHECKS; check 0 (fix) is always enabled
     checked_mask = int(parameters.get("EKF2_GPS_CHECK", -1)) << 1 | 1
-    failed_fraction_by_bit = {
-        bit: fraction
-        for bit in range(len(GNSS_CHECKS))
+    failed_checks = [
+        (fraction, *check)
+        for bit, check in enumerate(GNSS_CHECKS)
         if checked_mask >> bit & 1
         and (fraction := positions.compute_status_bit_fraction("failed_checks", bit))
         > MIN_GNSS_CHECK_FAILURE_FRACTION
-    }
-    if not failed_fraction_by_bit:
+    ]
+    if not failed_checks:
         return
-    failed_bits = sorted(failed_fraction_by_bit, key=lambda bit: -failed_fraction_by_bit[bit])
+    # Most frequent failures first
+    failed_checks.sort(key=lambda check: -check[0])
     check_texts = []
-    for bit in failed_bits[:3]:
-        name, parameter, unit = GNSS_CHECKS[bit]
-        failed_percent = 100.0 * failed_fraction_by_bit[bit]
+    for fraction, name, parameter, unit in failed_checks[:3]:
+        failed_percent = 100.0 * fraction
         limit_text = ""
         if parameter in parameters:
             limit_text = f", limit {parameter} {parameters[parameter]:g}{unit}"
         check_texts.append(f"{name} (failed {failed_percent:.0f} % of the time{limit_text})")
     yield UnmetCondition(
         "checks",
-        f"GNSS fails EKF2's check of the {GNSS_CHECKS[failed_bits[0]][0]}",
+        f"GNSS fails EKF2's check of the {failed_checks[0][1]}",
         f"Failed checks: {'; '.join(check_texts)}. EKF2 starts to fuse GNSS after "
         f"{parameters.get('EKF2_REQ_GPS_H', 10.0):g} s without a failure.",
         "Give the antenna a free view of the sky, and take off only after EKF2 fuses GNSS.",
