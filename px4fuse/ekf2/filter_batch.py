@@ -130,12 +130,27 @@ class FilterBatch:
             if name in self.parameters:
                 values = self.parameters[name]
                 values[values == inputs.settings[name]] = changed_value
-        self.estimates_biases = np.array([one.estimates_biases for one in configurations])
-        self.estimates_attitude = np.array([one.estimates_attitude for one in configurations])
-        self.has_gate = np.array([one.has_gate for one in configurations])
-        self.uses_logged_decisions = np.array([one.uses_logged_decisions for one in configurations])
-        self.uses_reported_noise = np.array([one.uses_reported_noise for one in configurations])
-        self.fuses_velocity = np.array([one.fuses_velocity for one in configurations])
+        # One row per configuration; the transposed table has one row per field
+        (
+            self.estimates_biases,
+            self.estimates_attitude,
+            self.has_gate,
+            self.uses_logged_decisions,
+            self.uses_reported_noise,
+            self.fuses_velocity,
+        ) = np.array(
+            [
+                (
+                    configuration.estimates_biases,
+                    configuration.estimates_attitude,
+                    configuration.has_gate,
+                    configuration.uses_logged_decisions,
+                    configuration.uses_reported_noise,
+                    configuration.fuses_velocity,
+                )
+                for configuration in configurations
+            ]
+        ).T
         self.events = np.stack([arrays.events for arrays in intervals], axis=1)
         self.event_steps = self.events["end_step"]
         self.event_time_s = segment.time_s[self.event_steps]

@@ -348,19 +348,19 @@ def _compute_bias_noise(batch: FilterBatch) -> ArrayPair:
     adds no process noise to a state whose variance exceeds the maximum.
     """
     process_noise, max_variance = np.zeros((2, len(batch.configurations), len(batch.segment.state)))
-    sensors_and_states = [("GYR_B", "GYR", GYRO_BIAS), ("ACC_B", "ACC", ACCELEROMETER_BIAS)]
+    sensors_and_states = [
+        ("GYR_B", "GYR", GYRO_BIAS, batch.estimates_attitude),
+        ("ACC_B", "ACC", ACCELEROMETER_BIAS, batch.estimates_biases),
+    ]
     if batch.segment.magnetic_field is not None:
         sensors_and_states += [
-            ("MAG_E", "MAG", EARTH_MAGNETIC_FIELD),
-            ("MAG_B", "MAG", BODY_MAGNETIC_FIELD),
+            ("MAG_E", "MAG", EARTH_MAGNETIC_FIELD, True),
+            ("MAG_B", "MAG", BODY_MAGNETIC_FIELD, True),
         ]
-    for bias_name, sensor_name, states in sensors_and_states:
-        noise_density = batch.parameters[f"EKF2_{bias_name}_NOISE"]
+    for bias_name, sensor_name, states, is_estimated in sensors_and_states:
+        noise_density = is_estimated * batch.parameters[f"EKF2_{bias_name}_NOISE"]
         process_noise[:, states] = (noise_density * batch.inputs.mean_step_s)[:, None] ** 2
         max_variance[:, states] = batch.parameters[f"EKF2_{sensor_name}_NOISE"][:, None] ** 2
-    # States that a filter does not estimate are constant
-    process_noise[~batch.estimates_attitude, GYRO_BIAS] = 0.0
-    process_noise[~batch.estimates_biases, ACCELEROMETER_BIAS] = 0.0
     return process_noise, max_variance
 
 
@@ -715,7 +715,7 @@ def estimate_state_correlation(inputs: ReplayInputs, segment: ReplaySegment) -> 
     if (preceding_segment := segment.preceding_segment) is None:
         correlation = _compute_steady_state_correlation(segment)
     else:
-        # Vision in addition to GNSS has no states of its own: it is omitted here
+        # Vision in addition to GNSS adds no states: it is omitted here
         inputs = replace(inputs, vision_positions=None)
         configuration = FilterConfiguration(inputs.settings)
         preceding_segment = replace(

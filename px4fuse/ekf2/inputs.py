@@ -520,10 +520,8 @@ def read_vision(
                 "rotate them to NED",
                 "Send the positions in NED, or also send the orientation.",
             )
-        ekf2_attitude, source_attitude = (
-            interpolate_attitude(orientations, timestamp_s)
-            for orientations in (attitude, track.orientation)
-        )
+        ekf2_attitude = interpolate_attitude(attitude, timestamp_s)
+        source_attitude = interpolate_attitude(track.orientation, timestamp_s)
         # From the vision frame to NED, at each sample
         rotation = to_rotation_matrix(multiply(ekf2_attitude, conjugate(source_attitude)))
         position_m = rotate(rotation, position_m)

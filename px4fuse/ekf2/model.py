@@ -46,7 +46,13 @@ from .filter_recursion import (
     run_segment,
 )
 from .heights import MIN_INNOVATION_GATE
-from .inputs import ANALYSIS_NAME, ReplayInputs, find_matching_samples, prepare_inputs
+from .inputs import (
+    ANALYSIS_NAME,
+    ReceivedPositions,
+    ReplayInputs,
+    find_matching_samples,
+    prepare_inputs,
+)
 from .intervals import make_event_intervals
 from .output_predictor import compute_published_state, sum_attitude_corrections
 from .replay import (
@@ -311,12 +317,15 @@ def _describe_modelled_aids(inputs: ReplayInputs) -> str:
 def add_position_noise(model: Ekf2Model, sigma_m: float, seed: int) -> Ekf2Model:
     """Add normal noise with standard deviation ``sigma_m`` (m) to each position in the inputs."""
     rng = np.random.default_rng(seed)
-    noisy_inputs: dict[str, Any] = {}
-    for name in ("received_positions", "vision_positions"):
-        if samples := getattr(model.inputs, name):
-            position_noise_m = rng.normal(scale=sigma_m, size=samples.position_m.shape)
-            noisy_inputs[name] = replace(samples, position_m=samples.position_m + position_noise_m)
-    return _replace_inputs(model, **noisy_inputs)
+
+    def add_noise(samples: ReceivedPositions) -> ReceivedPositions:
+        position_noise_m = rng.normal(scale=sigma_m, size=samples.position_m.shape)
+        return replace(samples, position_m=samples.position_m + position_noise_m)
+
+    received, vision = model.inputs.received_positions, model.inputs.vision_positions
+    return _replace_inputs(
+        model, received_positions=add_noise(received), vision_positions=vision and add_noise(vision)
+    )
 
 
 def misalign_positions(model: Ekf2Model, rotation_deg: float, delay_s: float) -> Ekf2Model:
