@@ -21,12 +21,12 @@ from px4fuse.ekf2.replay import (
     _compare_other_aids,
     _compute_heading_difference_deg,
     _judge_agreement,
-    _subtract_logged_state,
     compare_with_log,
     is_inside_spans,
     judge_agreement_with_logged_rejections,
     logged_innovations,
     match_updates,
+    subtract_states,
 )
 from px4fuse.flight.model import AidLog, Columns, Ekf2, FusionRecord, Unavailable
 
@@ -154,7 +154,7 @@ def test_ekf2_replay_minus_log_statistics_equal_closed_form():
     model = pd.DataFrame({"innovation_east_m": nu_log + 0.5, "innovation_variance_east_m2": s})
     still = pd.DataFrame(0.0, index=pd.Index([16.0, 17.0]), columns=Columns.STATE)
     off = still.assign(**{Columns.STATE[1]: [3.0, 4.0], Columns.STATE[4]: 0.25})
-    difference = _subtract_logged_state(SimpleNamespace(published_state=off), still)  # type: ignore[arg-type]
+    difference = subtract_states(off, still)
     found = _compare_axis("east", pd.DataFrame(frame), model, difference)
     assert found.innovation_correlation == pytest.approx(1.0)
     assert found.innovation_rms_difference == pytest.approx(0.5)

@@ -36,7 +36,12 @@ from px4fuse.ekf2.intervals import (
     make_event_intervals,
 )
 from px4fuse.ekf2.model import Ekf2Model, replay_with_settings
-from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, ReplaySegment, add_magnetic_field_states
+from px4fuse.ekf2.replay_segments import (
+    GRAVITY_M_S2,
+    ReplaySegment,
+    add_magnetic_field_states,
+    make_magnetic_field_samples,
+)
 from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, fill_parameters_with_defaults
 from px4fuse.trajectory.rotation import skew
@@ -353,9 +358,8 @@ def at_rest(
     if field_gauss is not None:
         at, known = np.arange(7, count, 7), np.append(field_gauss, np.zeros(3))
         gauss = np.tile(field_gauss, (len(at), 1))
-        segment = add_magnetic_field_states(
-            segment, segment.time_s[at], gauss, 1.0, known, np.full(6, 1e-8)
-        )
+        samples = make_magnetic_field_samples(segment, segment.time_s[at], gauss, 1.0)
+        segment = add_magnetic_field_states(segment, samples, known, np.full(6, 1e-8))
         segment.variance[2] = 0.01
     stamp = 10.105 + 0.1 * np.arange(len(measured_m))
     north = np.array(measured_m)

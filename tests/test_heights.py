@@ -80,7 +80,8 @@ def fusing(
         is_enabled_by_aid={"baro_hgt": np.ones_like(has_fix), "gnss_hgt": time_s < reference_until},
         parameters={"EKF2_BARO_NOISE": np.array([0.5]), "EKF2_BARO_GATE": np.array([5.0])},
     )  # fmt: skip
-    return HeightFilter(batch, has_fix, BadAccelerationFlag(np.array([True]), 3.0, segment))
+    flag = BadAccelerationFlag(np.array([True]), 3.0, segment)
+    return HeightFilter(batch, has_fix, np.zeros_like(time_s), flag)
 
 
 def standing(of: HeightSamples, count: int = 400, **how: Any) -> tuple[HeightFilter, pd.DataFrame]:
@@ -348,6 +349,7 @@ def test_two_large_height_innovations_set_bad_acceleration_flag() -> None:
 
     def event(time_s: float, barometer: list[float], gnss: float) -> list[float]:
         """Return the fraction of the 0.1 s before an event with the flag, then fuse samples."""
+        flag.apply_logged_flag(np.array([time_s]))
         share = flag.compute_bad_acceleration_fraction(np.array([time_s - 0.1]), np.array([time_s]))
         ratios.append(np.array([[one, one] for one in (*barometer, gnss)]))
         flag.update(np.array([time_s]), *ratios[-2:])
@@ -372,10 +374,12 @@ def test_ekf2_flag_for_bad_acceleration_is_read_from_log() -> None:
     is_bad[[*range(100, 150), *range(300, 401)]] = True
     segment = climbing(of_baro([10], [0.0]), is_acceleration_bad=is_bad)
     flag = BadAccelerationFlag(np.array([True]), 3.0, segment)
-    shares = [
-        flag.compute_bad_acceleration_fraction(np.array([end_s - 0.2]), np.array([end_s]))[0]
-        for end_s in (0.9, 1.1, 1.3, 1.6, 1.8, 4.0)
-    ]
+    shares = []
+    for end_s in (0.9, 1.1, 1.3, 1.6, 1.8, 4.0):
+        flag.apply_logged_flag(np.array([end_s]))
+        shares += flag.compute_bad_acceleration_fraction(
+            np.array([end_s - 0.2]), np.array([end_s])
+        ).tolist()
     assert shares == pytest.approx([0.0, 0.5, 1.0, 0.5, 0.0, 1.0])
 
 

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.arrays import Array, BoolArray, compute_median_interval_s
+from px4fuse.core.arrays import Array, BoolArray, compute_median_interval_s, select_intervals
 from px4fuse.core.record import (
     Correlation,
     Count,
@@ -201,8 +201,8 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         return samples[[f"{name}_{axis}" for axis in aid_log.axes]].to_numpy()
 
     innovation, innovation_variance = map(select_axis_columns, ("innovation", "variance"))
+    # 1. Decision of EKF2 on each sample: logged, or computed from the gate
     max_gap_s = MAX_TIME_WITHOUT_FUSION_S
-    is_enabled = _was_enabled(aid_log, sample_times_s)
     is_fusion_logged = "fused" in samples
     is_reset = np.zeros(len(samples), bool)
     noise_sigma_median = None
@@ -222,37 +222,21 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         if is_fused.sum() > 1:
             log_interval_s = compute_median_interval_s(sample_times_s[is_fused])
             max_gap_s = max(max_gap_s, MAX_LOG_INTERVALS_WITHOUT_FUSION * log_interval_s)
-    is_evaluated = (is_fused | is_rejected) & is_enabled & ~is_reset
-    longest_gap_s = _find_longest_gap(
-        sample_times_s[is_fused & is_enabled], aid_log, start_s, end_s
-    )
+    # Samples of a disabled source do not count
+    is_enabled = _was_enabled(aid_log, sample_times_s)
+    is_fused &= is_enabled
+    is_rejected &= is_enabled
+    enabled_count = max(int(is_enabled.sum()), 1)
+    # 2. Statistics of the innovations of each axis
+    is_evaluated = (is_fused | is_rejected) & ~is_reset
     axes = {}
     for axis, nu, S in zip(
         aid_log.axes, innovation[is_evaluated].T, innovation_variance[is_evaluated].T, strict=True
     ):
-        consistency = Consistency.from_innovations(nu, S, gate)
-        if not isinstance(consistency, Unavailable):
-            axes[axis] = AidAxisStatistics(
-                samples=consistency.count,
-                innovation_mean=consistency.innovation_mean_m,
-                innovation_std=consistency.innovation_std_m,
-                s_sqrt_median=consistency.sqrt_s_median_m,
-                nis_mean=consistency.nis_mean,
-                nis_band=consistency.nis_band,
-                sigma_ratio=consistency.sigma_ratio,
-                rejected_fraction=consistency.fraction_outside_gate,
-                bias_p=consistency.bias_p,
-                lag1_autocorrelation=consistency.lag1_autocorrelation,
-                ljung_box_p=consistency.ljung_box_p,
-                change=_find_largest_innovation_mean_change(
-                    sample_times_s[is_evaluated], nu / np.sqrt(S)
-                ),
-            )
-    fused_fraction = rejected_fraction = 0.0
-    if is_enabled.any():
-        fused_fraction, rejected_fraction = (
-            float(np.mean(mask[is_enabled])) for mask in (is_fused, is_rejected)
-        )
+        statistics = _evaluate_axis(sample_times_s[is_evaluated], nu, S, gate)
+        if statistics is not None:
+            axes[axis] = statistics
+    longest_gap_s = _find_longest_gap(sample_times_s[is_fused], aid_log, start_s, end_s)
     is_gap_too_long = longest_gap_s[1] - longest_gap_s[0] > max_gap_s
     return AidResult(
         label=aid.label,
@@ -261,9 +245,9 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         enabled_fraction=None
         if aid_log.enabled is None
         else float(np.mean(_was_enabled(aid_log, np.arange(start_s, end_s, 0.1)))),
-        fused_fraction=fused_fraction,
+        fused_fraction=int(is_fused.sum()) / enabled_count,
         fused_logged=is_fusion_logged,
-        rejected_fraction=rejected_fraction,
+        rejected_fraction=int(is_rejected.sum()) / enabled_count,
         longest_gap_s=longest_gap_s,
         resets=int(is_reset.sum()),
         gate=gate,
@@ -271,6 +255,27 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         noise_from=_find_noise_origin(aid, aid_log, noise_sigma_median),
         axes=axes,
         verdict=_classify_aid(axes, is_gap_too_long) if is_evaluated.any() else "disabled",
+    )
+
+
+def _evaluate_axis(times_s: Array, nu: Array, S: Array, gate: float) -> AidAxisStatistics | None:
+    """Return the statistics of innovations along one axis; None with too few innovations."""
+    consistency = Consistency.from_innovations(nu, S, gate)
+    if isinstance(consistency, Unavailable):
+        return None
+    return AidAxisStatistics(
+        samples=consistency.count,
+        innovation_mean=consistency.innovation_mean_m,
+        innovation_std=consistency.innovation_std_m,
+        s_sqrt_median=consistency.sqrt_s_median_m,
+        nis_mean=consistency.nis_mean,
+        nis_band=consistency.nis_band,
+        sigma_ratio=consistency.sigma_ratio,
+        rejected_fraction=consistency.fraction_outside_gate,
+        bias_p=consistency.bias_p,
+        lag1_autocorrelation=consistency.lag1_autocorrelation,
+        ljung_box_p=consistency.ljung_box_p,
+        change=_find_largest_innovation_mean_change(times_s, nu / np.sqrt(S)),
     )
 
 
@@ -293,25 +298,28 @@ def _find_largest_innovation_mean_change(
     windows = windows[windows["size"] >= MIN_INNOVATIONS_PER_WINDOW]
     window_means = windows["mean"].to_numpy()
     largest_mean_change = None
+    # A change must exceed the largest change so far, or this limit for the first
     min_mean_change = MIN_MEAN_CHANGE_IN_SIGMA
-    # The change happens in window ``index``. The means before and after exclude this window
+    # Test for a change in each window: compare all windows before it with the two after it. The
+    # window itself may contain both means, so it is in neither
     for index in range(MIN_WINDOWS_BEFORE_MEAN_CHANGE, len(window_means) - 2):
         mean_before_window = np.mean(window_means[:index])
         mean_change = float(np.mean(window_means[index + 1 : index + 3]) - mean_before_window)
+        # Without a change, the mean of the two windows scatters by its standard error, or more if
+        # the innovations are time-correlated
         std_before_window = np.std(normalised_innovations[window_index < windows.index[index]])
-        # Standard error of a mean of two windows
-        standard_error = std_before_window / math.sqrt(2.0 * windows["size"].iloc[:index].median())
+        innovations_per_window = windows["size"].iloc[:index].median()
+        standard_error = std_before_window / math.sqrt(2.0 * innovations_per_window)
         scatter_of_window_means = max(np.std(window_means[:index], ddof=1), standard_error)
         if abs(mean_change) > max(
             min_mean_change, MIN_MEAN_CHANGE_TO_SCATTER_RATIO * scatter_of_window_means
         ):
-            # If this window still has the earlier mean, the change begins with the next window
-            has_earlier_mean = (
-                abs(window_means[index] - mean_before_window) <= abs(mean_change) / 3.0
-            )
-            first_changed_window = windows.index[index + has_earlier_mean]
+            first_changed_index = index
+            if abs(window_means[index] - mean_before_window) <= abs(mean_change) / 3.0:
+                # This window still has the earlier mean
+                first_changed_index += 1
             largest_mean_change = (
-                float(time_s[0] + INNOVATION_MEAN_WINDOW_S * first_changed_window),
+                float(time_s[0] + INNOVATION_MEAN_WINDOW_S * windows.index[first_changed_index]),
                 mean_change,
             )
             min_mean_change = abs(mean_change)
@@ -332,30 +340,39 @@ def _find_applied_gate(aid: Aid, aid_log: AidLog) -> float:
 def _find_noise_origin(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> str:
     """Return the origin of R: a parameter name, or a text such as "reported accuracy"."""
     parameter_value = aid_log.parameters.get(aid.noise)
-    if noise_sigma is None or parameter_value is None:
-        return "" if noise_sigma is None else aid.noise_source_text
-    expected_noises = (
+    if noise_sigma is None:
+        return ""
+    if parameter_value is None:
+        return aid.noise_source_text
+    # The parameter is σ, σ without a factor (GNSS height), or a variance (EKF2_DRAG_NOISE)
+    possible_sigmas = (
         parameter_value,
         GNSS_HEIGHT_NOISE_FACTOR * parameter_value,
         math.sqrt(parameter_value),
     )
-    if np.isclose(noise_sigma, expected_noises, NOISE_RELATIVE_TOLERANCE, 0.0).any():
+    if np.isclose(noise_sigma, possible_sigmas, NOISE_RELATIVE_TOLERANCE, 0.0).any():
         return aid.noise
     return aid.noise_source_text or aid.noise
 
 
 def _find_longest_gap(fusion_times_s: Array, aid_log: AidLog, start_s: float, end_s: float) -> Span:
+    """Return start and end (s) of the longest time without a fused sample of an enabled source.
+
+    A sample whose fusion is not logged counts as fused.
+    """
     times_with_unknown_fusion_s = aid_log.times_with_unknown_fusion_s
     is_inside = (times_with_unknown_fusion_s > start_s) & (times_with_unknown_fusion_s < end_s)
     gap_limits_s = np.unique(
         np.r_[start_s, fusion_times_s, end_s, times_with_unknown_fusion_s[is_inside]]
     )
-    # EKF2 disables an aiding source up to 1 s after the last fused sample
-    is_enabled = _was_enabled(aid_log, gap_limits_s[:-1] + 1.0)
-    longest_index = int(np.argmax(np.diff(gap_limits_s) * is_enabled))
-    if not is_enabled[longest_index]:
-        return start_s, start_s
-    return float(gap_limits_s[longest_index]), float(gap_limits_s[longest_index + 1])
+    # EKF2 disables an aiding source up to 1 s after the last fused sample. A source that is then
+    # still enabled is missing: the gap counts
+    is_enabled_in_gap = _was_enabled(aid_log, gap_limits_s[:-1] + 1.0)
+    return max(
+        select_intervals(gap_limits_s, is_enabled_in_gap),
+        key=lambda gap: gap[1] - gap[0],
+        default=(start_s, start_s),
+    )
 
 
 def _classify_aid(axes: dict[str, AidAxisStatistics], is_gap_too_long: bool) -> AidVerdict:

@@ -7,6 +7,8 @@ Sources: PX4-Autopilot ``EKF/ekf_helper.cpp`` (updateAidSourceStatus),
 ``EKF/aid_sources/barometer/baro_height_control.cpp``, ``EKF/bias_estimator/bias_estimator.cpp``.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 import pandas as pd
 
@@ -52,19 +54,18 @@ def estimate_barometer_interval_s(fusion_record: FusionRecord) -> float:
             barometer_bias_updates
         )
         variance_growth_m2 = prior_variance_m2 - barometer_bias_updates["bias_m2"]
-        intervals_s = (
-            variance_growth_m2[len(variance_growth_m2) // 5 :] / POSITION_BIAS_NOISE_M_PER_SQRT_S**2
-        )
+        intervals_s = variance_growth_m2 / POSITION_BIAS_NOISE_M_PER_SQRT_S**2
+        # The first fifth may not yet be in the steady state
         lower_quartile_s, median_s, upper_quartile_s = np.percentile(
-            intervals_s, [25.0, 50.0, 75.0]
+            intervals_s[len(intervals_s) // 5 :], [25.0, 50.0, 75.0]
         )
         if upper_quartile_s - lower_quartile_s < MAX_RELATIVE_SPREAD_OF_INTERVALS * median_s:
             return float(median_s)
-    return 1.0 / (
-        BAROMETER_FUSION_RATE_HZ_BEFORE_V1_15
-        if fusion_record.has_delta_angle_biases
-        else BAROMETER_FUSION_RATE_HZ
-    )
+    # Without usable bias updates: the default rate of the release. Only releases before v1.15 log
+    # delta angle biases
+    if fusion_record.has_delta_angle_biases:
+        return 1.0 / BAROMETER_FUSION_RATE_HZ_BEFORE_V1_15
+    return 1.0 / BAROMETER_FUSION_RATE_HZ
 
 
 def _compute_bias_gain(barometer_bias_updates: pd.DataFrame) -> Array:
@@ -95,6 +96,48 @@ def find_fused_barometer_samples(
     )
 
 
+def _compute_bias_over_time(bias_updates: pd.DataFrame, interval_s: float) -> pd.Series:
+    """Return the barometer bias (m) before and after each update, by time (s).
+
+    EKF2 computes innovations with the bias before an update, but logs the bias after the update.
+    The bias changes in the half sample interval after the update.
+    """
+    bias_change_m = _compute_bias_gain(bias_updates) * bias_updates["innovation_m"]
+    bias_m = bias_updates["bias_m"]
+    bias_after_update_m = bias_m.set_axis(bias_m.index + 0.5 * interval_s)
+    changes = pd.concat([bias_m - bias_change_m.fillna(0.0), bias_after_update_m])
+    return pd.Series(changes).sort_index()
+
+
+def _make_measurement_prediction(
+    ekf2: Ekf2, fusion_record: FusionRecord, bias_m: pd.Series
+) -> Callable[[Array], Array]:
+    """Return the function of time (s) for EKF2's predicted barometer measurement (m, down).
+
+    The prediction is EKF2's height at the logged height updates, minus the barometer bias. Between
+    two updates, the integral of EKF2's vertical velocity is added.
+    """
+    updates = ekf2.aids[BAROMETER.name].samples
+    # In ground effect, EKF2 reduces innovations by a dead zone, so these innovations are not used
+    updates = updates[~fusion_record.was_flag_set(GROUND_EFFECT_FLAG, updates.index.to_numpy())]
+    velocity_times_s = ekf2.state.index.to_numpy()
+    displacement_m = integrate_cumulatively(ekf2.state["down_m_s"].to_numpy(), velocity_times_s)
+    height_minus_displacement_m = (
+        updates["observation_down"]
+        - updates["innovation_down"]
+        - np.interp(updates.index, velocity_times_s, displacement_m)
+    )
+
+    def predict_measured_down_m(time_s: Array) -> Array:
+        return np.asarray(
+            np.interp(time_s, updates.index, height_minus_displacement_m)
+            + np.interp(time_s, velocity_times_s, displacement_m)
+            - np.interp(time_s, bias_m.index, bias_m)
+        )
+
+    return predict_measured_down_m
+
+
 def _combine_barometer_samples(
     ekf2: Ekf2, fusion_record: FusionRecord, logged_down_m: pd.Series, interval_s: float
 ) -> pd.Series:
@@ -105,53 +148,32 @@ def _combine_barometer_samples(
     bias. The remaining gaps are filled with random heights that agree with EKF2's logged filtered
     innovation.
     """
-    logged_barometer_updates = ekf2.aids[BAROMETER.name].samples
-    if "observation_down" not in logged_barometer_updates or len(logged_barometer_updates) < 2:
+    logged_updates = ekf2.aids[BAROMETER.name].samples
+    if "observation_down" not in logged_updates or len(logged_updates) < 2:
         return logged_down_m
-    row_times_s = logged_barometer_updates.index.to_numpy()
-    velocity_down_m_s = ekf2.state["down_m_s"]
-    velocity_times_s = velocity_down_m_s.index.to_numpy()
-    displacement_m = integrate_cumulatively(velocity_down_m_s.to_numpy(), velocity_times_s)
+    row_times_s = logged_updates.index.to_numpy()
     zero_bias_update = {"bias_m": 0.0, "bias_m2": 0.0, "innovation_m": np.nan, "variance_m2": 1.0}
-    barometer_bias_updates = fusion_record.height_bias_updates.get(
+    bias_updates = fusion_record.height_bias_updates.get(
         BAROMETER.name, pd.DataFrame(zero_bias_update, index=row_times_s[:1])
     )
-    # EKF2 computes innovations with the bias before an update, but logs the bias after the update
-    bias_breakpoint_times_s = np.column_stack(
-        [barometer_bias_updates.index, barometer_bias_updates.index + 0.5 * interval_s]
-    ).ravel()
-    previous_bias_m = barometer_bias_updates["bias_m"] - (
-        _compute_bias_gain(barometer_bias_updates) * barometer_bias_updates["innovation_m"]
-    ).fillna(0.0)
-    bias_at_breakpoints_m = np.column_stack(
-        [previous_bias_m, barometer_bias_updates["bias_m"]]
-    ).ravel()
-    # In ground effect, EKF2 reduces innovations by a dead zone, so these innovations are not used
-    rows_outside_ground_effect = logged_barometer_updates[
-        ~fusion_record.was_flag_set(GROUND_EFFECT_FLAG, row_times_s)
-    ]
-    predicted_minus_velocity_integral_down_m = (
-        rows_outside_ground_effect["observation_down"]
-        - rows_outside_ground_effect["innovation_down"]
+    bias_m = _compute_bias_over_time(bias_updates, interval_s)
+    predict_measured_down_m = _make_measurement_prediction(ekf2, fusion_record, bias_m)
+    # 1. Heights of the three sources, in increasing priority: if the log contains a sample several
+    # times, the last is used
+    time_s = np.concatenate([bias_updates.index, logged_down_m.index, row_times_s])
+    down_m = np.concatenate(
+        [
+            predict_measured_down_m(bias_updates.index.to_numpy()) - bias_updates["innovation_m"],
+            logged_down_m,
+            # The logged observation is corrected for the bias
+            logged_updates["observation_down"] - np.interp(row_times_s, bias_m.index, bias_m),
+        ]
     )
-    predicted_minus_velocity_integral_down_m -= np.interp(
-        rows_outside_ground_effect.index, velocity_times_s, displacement_m
-    )
-
-    def interpolate_bias_m(time_s: Array) -> Array:
-        return np.asarray(np.interp(time_s, bias_breakpoint_times_s, bias_at_breakpoints_m))
-
-    def predict_measured_down_m(time_s: Array) -> Array:
-        """Return EKF2's predicted barometer measurement (m, down)."""
-        predicted_down_m = np.interp(
-            time_s, rows_outside_ground_effect.index, predicted_minus_velocity_integral_down_m
-        ) + np.interp(time_s, velocity_times_s, displacement_m)
-        return predicted_down_m - interpolate_bias_m(time_s)
-
-    # innovation_m: one row per interval between two logged samples, one column per sample that EKF2
-    # fused in the interval
+    # 2. Grid of all samples that EKF2 fused. One row per interval between two logged rows, one
+    # column per sample in the interval; the last sample is that of the logged row
     span_s = np.diff(row_times_s)
     sample_count = np.maximum(np.rint(span_s / interval_s), 1.0).astype(int)
+    # An interval is regular if it is a multiple of the sample interval. Others remain empty
     is_regular = (
         np.abs(span_s - sample_count * interval_s) < SAME_SAMPLE_TOLERANCE_IN_INTERVALS * interval_s
     )
@@ -159,16 +181,7 @@ def _combine_barometer_samples(
     sample_interval_by_row_s = span_s / sample_count
     sample_indices = np.arange(sample_count[is_regular].max(initial=1))
     innovation_m = np.full((len(sample_count), len(sample_indices)), np.nan)
-    # If the log contains a sample several times, the last of these three sources is used
-    time_s = np.concatenate([barometer_bias_updates.index, logged_down_m.index, row_times_s])
-    down_m = np.concatenate(
-        [
-            predict_measured_down_m(barometer_bias_updates.index.to_numpy())
-            - barometer_bias_updates["innovation_m"],
-            logged_down_m,
-            logged_barometer_updates["observation_down"] - interpolate_bias_m(row_times_s),
-        ]
-    )
+    # 3. Place of each height in the grid: row, and number of the sample from 1 to sample_count
     row_index = np.searchsorted(
         row_times_s[1:], time_s - SAME_SAMPLE_TOLERANCE_IN_INTERVALS * interval_s
     )
@@ -185,9 +198,8 @@ def _combine_barometer_samples(
     innovation_m[row_index[is_on_sample_grid], sample_number[is_on_sample_grid] - 1] = (
         down_m - predict_measured_down_m(time_s)
     )[is_on_sample_grid]
-    if "filtered_down" in logged_barometer_updates:
-        # PX4 logs the filtered innovation with the opposite sign: state minus measurement
-        low_pass_filtered_innovation_m = -logged_barometer_updates["filtered_down"].to_numpy()
+    # 4. Random values for the samples that are still missing
+    if "filtered_down" in logged_updates:
         age_in_samples = sample_count[:, None] - 1.0 - sample_indices
         is_missing = np.isnan(innovation_m) & (age_in_samples >= 0.0) & is_regular[:, None]
         innovation_m = _simulate_missing_innovations(
@@ -195,21 +207,19 @@ def _combine_barometer_samples(
             is_missing,
             sample_interval_by_row_s[:, None],
             age_in_samples,
-            low_pass_filtered_innovation_m,
+            # PX4 logs the filtered innovation with the opposite sign: state minus measurement
+            -logged_updates["filtered_down"].to_numpy(),
         )
-    sample_times_s = row_times_s[:-1, None] + sample_interval_by_row_s[:, None] * (
-        sample_indices + 1
-    )
+    # 5. Heights of the grid, and of the samples that are not on the grid
     has_sample = np.isfinite(innovation_m)
-    sample_times_s = sample_times_s[has_sample]
-    time_s = np.concatenate([sample_times_s, time_s[~is_on_sample_grid]])
-    down_m = np.concatenate(
-        [
-            predict_measured_down_m(sample_times_s) + innovation_m[has_sample],
-            down_m[~is_on_sample_grid],
-        ]
+    grid_times_s = row_times_s[:-1, None] + sample_interval_by_row_s[:, None] * (sample_indices + 1)
+    grid_times_s = grid_times_s[has_sample]
+    grid_down_m = predict_measured_down_m(grid_times_s) + innovation_m[has_sample]
+    height_samples = pd.Series(
+        np.append(grid_down_m, down_m[~is_on_sample_grid]),
+        pd.Index(np.append(grid_times_s, time_s[~is_on_sample_grid]), name="time_s"),
     )
-    height_samples = pd.Series(down_m, pd.Index(time_s, name="time_s")).dropna().sort_index()
+    height_samples = height_samples.dropna().sort_index()
     return height_samples[
         np.diff(height_samples.index, prepend=-np.inf)
         > SAME_SAMPLE_TOLERANCE_IN_INTERVALS * interval_s
@@ -245,21 +255,24 @@ def _simulate_missing_innovations(
     # f_previous + Σ w (1 - w)^age ν. All simulated innovations of an interval are shifted by the
     # same offset, so that f is the logged value
     w = interval_s / (interval_s + INNOVATION_LOW_PASS_TIME_CONSTANT_S)
-    low_pass_weight = w * (1.0 - w) ** np.maximum(age_in_samples, 0.0)
-    simulated_innovation_m = np.random.default_rng(0).normal(
+    # After the k samples of an interval: f = (1 - w)^k f_previous + Σ w (1 - w)^age ν
+    sample_weight = w * (1.0 - w) ** np.maximum(age_in_samples, 0.0)
+    sample_count = age_in_samples[:, 0] + 1.0
+    previous_weight = (1.0 - w[:, 0]) ** sample_count
+    # Random innovations with the scatter of the known innovations. The padding after the last
+    # sample of an interval stays NaN
+    random_innovation_m = np.random.default_rng(0).normal(
         scale=np.nanstd(innovation_m), size=innovation_m.shape
     )
-    # An interval with fewer samples than columns is padded with NaN, which is not replaced
-    filled_innovation_m = np.where(is_missing, simulated_innovation_m, innovation_m)
-    previous_filtered_innovation_weight = (1.0 - w[:, 0]) ** (age_in_samples[:, 0] + 1.0)
-    simulated_innovation_offset_m = (
+    filled_innovation_m = np.where(is_missing, random_innovation_m, innovation_m)
+    # All random innovations of an interval are shifted by the same offset, so that the equation
+    # holds: offset · Σ weight of missing samples = f - computed f
+    filtered_innovation_error_m = (
         low_pass_filtered_innovation_m[1:]
-        - previous_filtered_innovation_weight * low_pass_filtered_innovation_m[:-1]
-        - np.nansum(low_pass_weight * filled_innovation_m, axis=1)
+        - previous_weight * low_pass_filtered_innovation_m[:-1]
+        - np.nansum(sample_weight * filled_innovation_m, axis=1)
     )
-    simulated_innovation_offset_m /= np.maximum(
-        (low_pass_weight * is_missing).sum(axis=1), MIN_WEIGHT_SUM_OF_MISSING_SAMPLES
+    offset_m = filtered_innovation_error_m / np.maximum(
+        (sample_weight * is_missing).sum(axis=1), MIN_WEIGHT_SUM_OF_MISSING_SAMPLES
     )
-    return np.where(
-        is_missing, simulated_innovation_m + simulated_innovation_offset_m[:, None], innovation_m
-    )
+    return np.where(is_missing, random_innovation_m + offset_m[:, None], innovation_m)

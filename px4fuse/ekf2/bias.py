@@ -8,7 +8,7 @@ Source: PX4-Autopilot ``EKF/bias_estimator`` (``bias_estimator.cpp``; before v1.
 
 import numpy as np
 
-from px4fuse.core.arrays import Array, BoolArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray
 
 # Noise density (m/√s) of the random walk of a height or vision bias (bias_nsd, common.h)
 POSITION_BIAS_NOISE_M_PER_SQRT_S = 0.13
@@ -53,7 +53,7 @@ class BiasEstimator:
         interval_s: Array,
         is_bias_updated: BoolArray,
         represented_sample_count: Array | float = 1.0,
-    ) -> tuple[Array, Array]:
+    ) -> ArrayPair:
         """Correct a measurement for the bias, and update the bias; return innovation and R.
 
         Parameters
@@ -65,6 +65,7 @@ class BiasEstimator:
         represented_sample_count : float or ndarray, shape (filters,)
             Number of EKF2 samples that this sample represents.
         """
+        # 1. Prediction: the variance grows by the random walk since the previous sample
         is_bias_wrong = np.abs(self.mean_signed_test_ratio) > MAX_MEAN_TEST_RATIO_OF_VALID_BIAS
         bias_noise_m2_per_s = np.where(
             is_bias_wrong,
@@ -76,20 +77,23 @@ class BiasEstimator:
         # which is measurement minus state. The innovation of the bias filter is -ν
         innovation_m = innovation_m + self.bias_m
         R = R_m2 + bias_variance
-        # The mean of n samples has 1/n of the variance of one sample; the bias is the same for all
+        # 3. Update of the bias. The bias filter measures state minus measurement: its innovation is
+        # -ν, and its measurement noise is that of ν. The mean of n samples has 1/n of the variance
+        # of one sample, but the bias is the same for all
+        bias_innovation_m = -innovation_m
         S = bias_variance + (R_m2 + predicted_variance) / represented_sample_count
-        test_ratio = innovation_m * innovation_m / (POSITION_BIAS_GATE**2 * S)
-        K = bias_variance / S * (is_bias_updated & (test_ratio < 1.0))
-        self.bias_m = self.bias_m - K * innovation_m
+        test_ratio = bias_innovation_m**2 / (POSITION_BIAS_GATE**2 * S)
+        is_fused = is_bias_updated & (test_ratio < 1.0)
+        K = is_fused * bias_variance / S
+        self.bias_m = self.bias_m + K * bias_innovation_m
         self.variance_m2 = np.maximum(
             bias_variance - K * bias_variance, MIN_POSITION_BIAS_VARIANCE_M2
         )
-        # EKF2 low-pass filters the test ratio with the sign of the bias filter's innovation, -ν
-        signed_test_ratio = np.copysign(np.minimum(test_ratio, 1.0), -innovation_m)
-        self.mean_signed_test_ratio = self.mean_signed_test_ratio + (
-            self.test_ratio_filter_weight
-            * represented_sample_count
-            * is_bias_updated
-            * (signed_test_ratio - self.mean_signed_test_ratio)
+        # 4. Low-pass filter of the test ratio with the sign of the innovation. n samples have n
+        # times the weight of one sample
+        signed_test_ratio = np.copysign(np.minimum(test_ratio, 1.0), bias_innovation_m)
+        filter_weight = is_bias_updated * self.test_ratio_filter_weight * represented_sample_count
+        self.mean_signed_test_ratio = self.mean_signed_test_ratio + filter_weight * (
+            signed_test_ratio - self.mean_signed_test_ratio
         )
         return innovation_m, R

@@ -74,20 +74,23 @@ class FilterConfiguration:
     def compute_delays(self, inputs: ReplayInputs) -> FusionDelays:
         """Return the delay of the position source, and the delay of the fusion horizon."""
         if self.timestamp_offset_s is not None:
-            # This delay cancels the half prediction step that EKF2 subtracts from timestamps. With
-            # an infinite delay of the fusion horizon, no sample is late
+            # Measurement time: timestamp + offset. EKF2 also subtracts half a prediction step,
+            # which is added here. With an infinite delay of the horizon, no sample is late
             return FusionDelays(-self.timestamp_offset_s - 0.5 * inputs.mean_step_s, np.inf)
         delay_s = self.settings[inputs.aid.delay] * 1e-3
         delays_ms = [self.settings.get(aid.delay, 0.0) for aid in (GNSS_POS, EV_POS)]
-        min_horizon_s = inputs.horizon_s
-        if not inputs.rules.is_horizon_set_by_largest_delay:
+        if inputs.rules.is_horizon_set_by_largest_delay:
+            # The delay of another sensor may be the largest: the logged delay is the minimum
+            min_horizon_s = inputs.horizon_s
+        else:
             # EKF2 raises EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp)
             delays_ms.append(self.settings["EKF2_DELAY_MAX"])
             min_horizon_s = inputs.mean_step_s
             # With the logged EKF2_DELAY_MAX, the logged delay of the fusion horizon applies
             if max(delays_ms) == inputs.settings["EKF2_DELAY_MAX"]:
                 return FusionDelays(delay_s, inputs.horizon_s)
-        # Number of samples in the IMU buffer (initialise_interface, estimator_interface.cpp)
+        # Number of samples in the IMU buffer (initialise_interface, estimator_interface.cpp). The
+        # fusion horizon is the oldest of them
         buffer_length = math.ceil(max(delays_ms) * 1e-3 / inputs.configured_step_s)
         return FusionDelays(delay_s, max((buffer_length - 1) * inputs.mean_step_s, min_horizon_s))
 
@@ -121,12 +124,13 @@ class FilterBatch:
             name: np.array([configuration.settings[name] for configuration in configurations])
             for name in inputs.settings
         }
-        # If a parameter changed in flight, apply the change only to configurations with the logged
-        # value of the parameter, not to those that test another value
+        # EKF2's parameters were changed in flight before this segment. The change applies to
+        # filters with the logged start value; a filter with another value keeps that value
         for name, changed_value in segment.changed_parameters.items():
             if name in self.parameters:
                 values = self.parameters[name]
                 values[values == inputs.settings[name]] = changed_value
+        # One row per configuration; the transposed table has one row per field
         (
             self.estimates_biases,
             self.estimates_attitude,

@@ -20,6 +20,7 @@ from px4fuse.core.arrays import Array, Array32, ArrayPair, BoolArray, IntArray
 from px4fuse.flight.ekf2_parameters import FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
 
 from .filter_batch import FilterBatch, FilterConfiguration
+from .height_samples import POSITION_DOWN
 from .heights import (
     GNSS_HEIGHT_NOISE_FACTOR,
     MIN_INNOVATION_GATE,
@@ -48,6 +49,7 @@ from .replay_segments import (
     EARTH_MAGNETIC_FIELD,
     GRAVITY_M_S2,
     GYRO_BIAS,
+    HORIZONTAL_POSITION,
     MOTION_STATE_COUNT,
     STATE_COUNT,
     THETA,
@@ -75,11 +77,12 @@ MAX_BIAS_SIGMA_M_S2 = 0.1 * GRAVITY_MAGNITUDE_M_S2
 # Minimum variance of an accelerometer bias ÷ largest bias variance of the three axes
 # (covariance.cpp)
 MIN_RATIO_TO_LARGEST_BIAS_VARIANCE = 0.01
-# State indices of heading error and position
-HEADING, POSITION_NORTH, POSITION_EAST, POSITION_DOWN = 2, 6, 7, 8
+# State indices of the attitude error
+TILT_ABOUT_NORTH, TILT_ABOUT_EAST, HEADING = 0, 1, 2
+# State indices of the horizontal position
+POSITION_NORTH, POSITION_EAST = 6, 7
 # State indices of the accelerometer bias
 ACCELEROMETER_BIAS_NORTH, ACCELEROMETER_BIAS_EAST, ACCELEROMETER_BIAS_DOWN = 12, 13, 14
-HORIZONTAL_POSITION = slice(POSITION_NORTH, POSITION_EAST + 1)
 # State indices of velocity and position
 VELOCITY_AND_POSITION = slice(3, 9)
 # Columns in measurements of velocity (0 to 2) and position (3 to 5), NED
@@ -131,13 +134,16 @@ class SegmentRun:
     vision_filter: VisionFilter | None = None
 
 
-def run_segment(  # noqa: PLR0912, PLR0915 (the order of EKF2's fusions in one place)
+def run_segment(  # noqa: PLR0912 (the order of EKF2's fusions in one place)
     inputs: ReplayInputs,
     segment: ReplaySegment,
     configurations: Sequence[FilterConfiguration],
     intervals: Sequence[EventIntervals],
 ) -> SegmentRun:
     """Run several filter configurations through one part of a flight.
+
+    The loop predicts state x and covariance P to each event, and then fuses the samples in the
+    order of EKF2. x and P are changed in place (prediction, resets) or replaced (fusions).
 
     ``intervals`` contains the intervals between fusions, one item per configuration.
     """
@@ -157,46 +163,51 @@ def run_segment(  # noqa: PLR0912, PLR0915 (the order of EKF2's fusions in one p
     ]
     height_filter = vision_filter = None
     if segment.height_samples is not None:
-        height_filter = HeightFilter(batch, positions.has_action, bad_acceleration_flag)
+        height_filter = HeightFilter(
+            batch,
+            positions.has_action,
+            positions.measured_values[..., DOWN_COLUMN],
+            bad_acceleration_flag,
+        )
     if inputs.vision_positions is not None:
         vision_filter = VisionFilter(batch)
     x, P = _make_start_state(batch, bad_acceleration_flag)
     event_count, configuration_count = batch.events.shape
     magnetometer_updates = np.full(
-        (event_count * (segment.magnetic_field is not None), 3, configuration_count, 3), np.nan
+        (event_count if segment.magnetic_field else 0, 3, configuration_count, 3), np.nan
     )
     states = np.empty((event_count + 1, *x.shape))
     state_variances = np.empty(states.shape, np.float32)
     states[0], state_variances[0] = x, _get_state_variances(P)
     for event in range(event_count):
-        accelerometer_bias_before_fusion = x[:, ACCELEROMETER_BIAS].copy()
-        bias_covariance = P[:, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS].copy()
+        # 1. Prediction
         prediction.predict(event, x, P)
-        is_accelerometer_bias_constant = bad_acceleration_flag.until_s > batch.event_time_s[event]
+        # 2. Magnetometer and optical flow
         for aid, mean_samples, gate, state_slices in mean_sensors:
             if mean_samples.sample_count[event].any():
                 mean_sample = EventSamples(*(quantity[event] for quantity in mean_samples))
                 x, P, update = fuse_mean_sample(x, P, mean_sample, gate, *state_slices)
                 if aid == MAG:
                     magnetometer_updates[event] = update
+        # 3. Vision samples of earlier prediction steps than the GNSS sample
         if vision_filter is not None:
             x, P = vision_filter.fuse(event, x, P, False, positions.decisions.last_position_s)
+        # 4. Barometer, GNSS velocity and position, GNSS height
         if height_filter is not None:
             x, P = height_filter.fuse_barometer(event, x, P)
         if positions.has_sample[event]:
             x, P = positions.test_and_fuse_gnss(event, x, P)
         if height_filter is not None:
-            x, P = height_filter.fuse_gnss(
-                event,
-                x,
-                P,
-                positions.measured_values[event, :, DOWN_COLUMN],
-                positions.measurement_variance[event, :, DOWN_COLUMN],
-            )
+            gnss_variance_m2 = positions.measurement_variance[event, :, DOWN_COLUMN]
+            x, P = height_filter.fuse_gnss(event, x, P, gnss_variance_m2)
+        # 5. Vision as the only position source; logged height and heading
         x, P = positions.fuse_vision_and_logged_states(event, x, P)
+        # 6. Reset to the sample of the position source
         if positions.reset[event].any():
             positions.reset_states(event, x, P)
+        # 7. Vision samples of the same prediction step as the GNSS sample
         if vision_filter is not None:
+            # The vision bias is state minus measurement, so a reset changes it like the state
             vision_filter.bias.bias_m = vision_filter.bias.bias_m + positions.reset_m[event]
             x, P = vision_filter.fuse(event, x, P, True, positions.decisions.last_position_s)
             # EKF2's timeout for a position reset also starts again when EKF2 fuses vision
@@ -204,40 +215,34 @@ def run_segment(  # noqa: PLR0912, PLR0915 (the order of EKF2's fusions in one p
                 positions.decisions.last_position_s = np.maximum(
                     positions.decisions.last_position_s, vision_filter.last_fusion_s
                 )
+        # 8. Bad acceleration: flag for the next events, and accelerometer bias
         if height_filter is not None and not bad_acceleration_flag.uses_logged_flag.all():
             height_filter.update_bad_acceleration_flag(
                 event, batch.event_time_s[event], positions.get_velocity_down_update(event)
             )
-        # While EKF2 flags a bad acceleration, its accelerometer bias is constant
-        if is_accelerometer_bias_constant.any():
-            x[is_accelerometer_bias_constant, ACCELEROMETER_BIAS] = (
-                accelerometer_bias_before_fusion[is_accelerometer_bias_constant]
-            )
-            P[is_accelerometer_bias_constant, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = (
-                bias_covariance[is_accelerometer_bias_constant]
-            )
+        prediction.restore_constant_bias(x, P)
         states[event + 1], state_variances[event + 1] = x, _get_state_variances(P)
     positions.innovation[~positions.has_action] = np.nan
     positions.innovation_variance[~positions.has_action] = np.nan
     if vision_filter is not None:
         positions.reset_m += vision_filter.position_reset_m
     return SegmentRun(
-        segment,
-        tuple(configurations),
-        tuple(arrays.events for arrays in intervals),
-        positions.innovation,
-        positions.innovation_variance,
-        positions.measurement_variance.astype(np.float32),
-        positions.rejected,
-        positions.fused,
-        positions.reset,
-        positions.reset_m,
-        states,
-        state_variances,
-        P,
-        magnetometer_updates,
-        height_filter,
-        vision_filter,
+        segment=segment,
+        configurations=tuple(configurations),
+        events=tuple(arrays.events for arrays in intervals),
+        innovation=positions.innovation,
+        innovation_variance=positions.innovation_variance,
+        noise=positions.measurement_variance.astype(np.float32),
+        rejected=positions.rejected,
+        fused=positions.fused,
+        reset=positions.reset,
+        position_reset_m=positions.reset_m,
+        state=states,
+        variance=state_variances,
+        covariance=P,
+        magnetometer_updates=magnetometer_updates,
+        height_filter=height_filter,
+        vision_filter=vision_filter,
     )
 
 
@@ -251,16 +256,16 @@ class _Prediction:
             batch.parameters["EKF2_ACC_NOISE"] ** 2, (len(self.step_counts), 1)
         )
         if (clipped_fraction := batch.segment.clipped_fraction) is not None:
-            # While an accelerometer clips, EKF2 uses BAD_ACCELERATION_NOISE_M_S2
-            clipped_fraction_sum_by_event = np.diff(
-                np.cumsum(clipped_fraction)[batch.event_steps],
-                axis=0,
-                prepend=clipped_fraction[0],
-            )
-            self.acceleration_variance += (
-                clipped_fraction_sum_by_event
-                / np.maximum(self.step_counts, 1)
-                * (BAD_ACCELERATION_NOISE_M_S2**2 - self.acceleration_variance)
+            # While an accelerometer clips, EKF2 uses BAD_ACCELERATION_NOISE_M_S2. The variance of
+            # an event is the mean over its prediction steps
+            clipped_fraction_sums = np.cumsum(clipped_fraction)
+            previous_event_steps = batch.event_steps - self.step_counts
+            mean_clipped_fraction = (
+                clipped_fraction_sums[batch.event_steps]
+                - clipped_fraction_sums[previous_event_steps]
+            ) / np.maximum(self.step_counts, 1)
+            self.acceleration_variance += mean_clipped_fraction * (
+                BAD_ACCELERATION_NOISE_M_S2**2 - self.acceleration_variance
             )
         self.bias_noise_per_step, self.max_variance_with_noise = _compute_bias_noise(batch)
 
@@ -289,19 +294,25 @@ class _Prediction:
 
     def predict(self, event: int, x: Array, P: Array) -> None:
         """Predict x and P at an event in place; call this method in order of events."""
+        batch, flag = self.batch, self.bad_acceleration_flag
+        self.bias_at_previous_event = x[:, ACCELEROMETER_BIAS].copy()
+        self.bias_covariance_at_previous_event = P[:, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS].copy()
         row = event % EVENT_BATCH_SIZE
         if row == 0:
             self._prepare_transitions(slice(event, event + EVENT_BATCH_SIZE))
-        phi, time_s = self.transition[row], self.batch.event_time_s
+        # Φ has the rows of the motion states, which are the first states. The others are constant
+        phi = self.transition[row]
         x[:, :MOTION_STATE_COUNT] = (phi @ x[:, :STATE_COUNT, None])[:, :, 0]
         x[:, :MOTION_STATE_COUNT] += self.state_change[row]
         P[:, :MOTION_STATE_COUNT] = phi @ P[:, :STATE_COUNT]
         P[:, :, :MOTION_STATE_COUNT] = P[:, :, :STATE_COUNT] @ np.swapaxes(phi, 1, 2)
+        # motion_covariance and variances are views: adding to them changes P
         motion_covariance = P[:, :MOTION_STATE_COUNT, :MOTION_STATE_COUNT]
         motion_covariance += self.process_noise[row]
-        bad_acceleration_fraction = self.bad_acceleration_flag.compute_bad_acceleration_fraction(
-            time_s[event - 1] if event else self.batch.segment.time_s[:1], time_s[event]
-        )
+        end_s = batch.event_time_s[event]
+        begin_s = batch.event_time_s[event - 1] if event else batch.segment.time_s[:1]
+        flag.apply_logged_flag(end_s)
+        bad_acceleration_fraction = flag.compute_bad_acceleration_fraction(begin_s, end_s)
         if bad_acceleration_fraction.any():
             variance_increase = bad_acceleration_fraction * (
                 BAD_ACCELERATION_NOISE_M_S2**2 - self.acceleration_variance[event]
@@ -309,12 +320,25 @@ class _Prediction:
             motion_covariance += (
                 variance_increase[:, None, None] * self.accelerometer_noise_covariance[row]
             )
+        self.is_bias_constant = flag.until_s > end_s
         variances = _get_state_variances(P)
         variances += (variances < self.max_variance_with_noise) * (
             self.bias_noise_per_step * self.step_counts[event, :, None]
         )
-        if min_bias_variance := self.batch.inputs.rules.min_accelerometer_bias_variance_m2_s4:
-            _limit_bias_variance(P, min_bias_variance, self.batch.estimates_biases)
+        if min_bias_variance := batch.inputs.rules.min_accelerometer_bias_variance_m2_s4:
+            _limit_bias_variance(P, min_bias_variance, batch.estimates_biases)
+
+    def restore_constant_bias(self, x: Array, P: Array) -> None:
+        """Undo the fusions of an event for an accelerometer bias that EKF2 holds constant.
+
+        EKF2 holds the bias while it flags a bad acceleration. x and P are changed in place.
+        """
+        selected = self.is_bias_constant
+        if selected.any():
+            x[selected, ACCELEROMETER_BIAS] = self.bias_at_previous_event[selected]
+            P[selected, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = (
+                self.bias_covariance_at_previous_event[selected]
+            )
 
 
 def _compute_bias_noise(batch: FilterBatch) -> ArrayPair:
@@ -359,18 +383,23 @@ class _PositionFusion:
         inputs, parameters, events = batch.inputs, batch.parameters, batch.events
         self.has_velocity = inputs.received_positions.velocity_m_s is not None
         self.batch, self.bad_acceleration_flag = batch, bad_acceleration_flag
+        # Filters without gate fuse every usable sample
         action = np.where(batch.has_gate, events["action"], FUSE * events["usable"])
         self.has_action = action > NO_ACTION
         self.has_sample = np.any(self.has_action, axis=1).tolist()
         self.can_fuse_velocity = (
             (action == FUSE) & batch.is_enabled_by_aid[GNSS_VEL.name] & batch.fuses_velocity
         )
+        # Squared gate of each component, shape (filters, 6): velocity three times, position three
+        # times. Without a velocity, its columns are not used
         position_gate = parameters[inputs.aid.gate]
-        gates = parameters.get(GNSS_VEL.gate, position_gate), position_gate
-        self.gate_squared = np.maximum(np.repeat(gates, 3, axis=0).T, MIN_INNOVATION_GATE) ** 2
+        velocity_gate = parameters.get(GNSS_VEL.gate, position_gate)
+        gates = np.column_stack([*[velocity_gate] * 3, *[position_gate] * 3])
+        self.gate_squared = np.maximum(gates, MIN_INNOVATION_GATE) ** 2
         self.measured_values, self.measurement_variance = _collect_measurements(batch)
         self.decisions = _FusionDecisions(batch, action)
         self.innovation = np.full((*events.shape, 6), np.nan)
+        # float32 saves memory
         self.innovation_variance = self.innovation.astype(np.float32)
         self.rejected, self.fused, self.reset = np.zeros((3, *events.shape), bool)
         self.reset_m = np.zeros((*events.shape, 2))
@@ -378,15 +407,16 @@ class _PositionFusion:
     def test_and_fuse_gnss(self, event: int, x: Array, P: Array) -> ArrayPair:
         """Test the sample of an event with the gate, and fuse it if it is from GNSS."""
         batch, R = self.batch, self.measurement_variance[event]
+        # 1. Innovation and gate of each component
         nu = self.measured_values[event] - x[:, VELOCITY_AND_POSITION]
         S = _get_state_variances(P)[:, VELOCITY_AND_POSITION] + R
         is_outside_gate = nu * nu > self.gate_squared * S
         if is_outside_gate[:, VELOCITY_DOWN_COLUMN].any():
             # With a bad vertical acceleration, EKF2 clips the vertical innovation to the gate
-            is_clipped = batch.has_gate & (
-                self.bad_acceleration_flag.until_s > batch.event_time_s[event]
-            )
-            is_clipped &= ~is_outside_gate[:, :VELOCITY_DOWN_COLUMN].any(axis=1)
+            # instead of rejecting the velocity, if the horizontal velocity is inside its gate
+            is_horizontal_inside = ~is_outside_gate[:, :VELOCITY_DOWN_COLUMN].any(axis=1)
+            is_acceleration_bad = self.bad_acceleration_flag.until_s > batch.event_time_s[event]
+            is_clipped = batch.has_gate & is_horizontal_inside & is_acceleration_bad
             limit = np.sqrt(self.gate_squared * S)[:, VELOCITY_DOWN_COLUMN]
             velocity_down_innovation = nu[:, VELOCITY_DOWN_COLUMN]
             np.clip(
@@ -394,6 +424,7 @@ class _PositionFusion:
             )
             is_outside_gate[is_clipped, VELOCITY_DOWN_COLUMN] = False
         self.innovation[event], self.innovation_variance[event] = nu, S
+        # 2. Decision
         is_velocity_outside = is_outside_gate[:, VELOCITY_COLUMNS].any(axis=1)
         self.rejected[event], self.fused[event], self.reset[event], is_velocity_fused = (
             self.decisions.decide_fusion(
@@ -402,6 +433,7 @@ class _PositionFusion:
                 self.can_fuse_velocity[event] & ~(is_velocity_outside & batch.has_gate),
             )
         )
+        # 3. Update
         if batch.inputs.aid != GNSS_POS:
             return x, P
         if batch.segment.magnetic_field is None:
@@ -412,10 +444,10 @@ class _PositionFusion:
                 noise = _compute_noise_for_target_variance(
                     P, tilt_row, logged_variance[:, tilt_row]
                 )
+                # The innovation is 0: the fusion changes only P
                 x, P = _fuse_states(x, P, [(tilt_row, x[:, tilt_row], noise)])
-        is_component_fused = np.repeat(
-            [is_velocity_fused & self.has_velocity, self.fused[event]], [3, 2], axis=0
-        ).T
+        is_velocity_fused &= self.has_velocity
+        is_component_fused = np.column_stack([*[is_velocity_fused] * 3, *[self.fused[event]] * 2])
         return _update_sequentially(x, P, nu, S, R, is_component_fused)
 
     def fuse_vision_and_logged_states(self, event: int, x: Array, P: Array) -> ArrayPair:
@@ -426,29 +458,32 @@ class _PositionFusion:
         """
         batch, segment = self.batch, self.batch.segment
         steps = batch.event_steps[event]
+        # 1. Logged states: state index, value and R
+        measurements = []
         is_heading_logged = segment.magnetic_field is None
         heading_error_rad = batch.estimates_attitude * segment.attitude_error_rad[steps, HEADING]
-        logged_states = []
         if is_heading_logged:
             logged_variance = segment.attitude_variance_rad2[steps, HEADING]
-            logged_states.append((HEADING, heading_error_rad, logged_variance))
+            R = _compute_noise_for_target_variance(P, HEADING, logged_variance)
+            measurements.append((HEADING, heading_error_rad, R))
         if segment.height_samples is None and not batch.inputs.fuses_vision_height:
             logged_variance = segment.down_variance_m2[steps]
-            logged_states.append((POSITION_DOWN, segment.down_m[steps], logged_variance))
-        measurements = [
-            (row, value, _compute_noise_for_target_variance(P, row, logged_variance))
-            for row, value, logged_variance in logged_states
-        ]
+            R = _compute_noise_for_target_variance(P, POSITION_DOWN, logged_variance)
+            measurements.append((POSITION_DOWN, segment.down_m[steps], R))
+        # 2. External vision, if it is the position source
         if batch.inputs.aid != GNSS_POS and self.has_sample[event]:
-            is_fused = self.fused[event]
-            fused_states = [(POSITION_NORTH, is_fused), (POSITION_EAST, is_fused)]
+            fused_states = [(POSITION_NORTH, self.fused), (POSITION_EAST, self.fused)]
             if batch.inputs.fuses_vision_height:
-                fused_states.append((POSITION_DOWN, self.has_action[event]))
+                # The gate tests only the horizontal position
+                fused_states.append((POSITION_DOWN, self.has_action))
             for row, is_fused in fused_states:
                 column = row - VELOCITY_AND_POSITION.start
-                noise = np.where(is_fused, self.measurement_variance[event, :, column], np.inf)
-                measurements.append((row, self.measured_values[event, :, column], noise))
+                R = np.where(is_fused[event], self.measurement_variance[event, :, column], np.inf)
+                measurements.append((row, self.measured_values[event, :, column], R))
         x, P = _fuse_states(x, P, measurements)
+        # 3. If the variance of a state is already below the logged variance, its fusion has no
+        # effect. Therefore the value is set. In flights with vision (logged heading), the height is
+        # not set, because it may be the fused vision height
         if is_heading_logged:
             x[:, HEADING] = heading_error_rad
             P = 0.5 * (P + np.swapaxes(P, 1, 2))
@@ -479,14 +514,19 @@ class _PositionFusion:
 
 
 def _average_samples(batch: FilterBatch, aid: Aid, samples: SensorSamples) -> EventSamples:
-    """Return the mean magnetometer or optical flow samples, shape (events, filters)."""
+    """Return the mean magnetometer or optical flow samples, shape (events, filters).
+
+    The events of each filter are a column of ``batch.event_steps``.
+    """
     mean_samples = EventSamples(
         *_stack_by_filter(
             [average_by_event(batch.segment, samples, steps) for steps in batch.event_steps.T]
         )
     )
+    # An event without samples is not fused
     mean_samples.sample_count[:] *= batch.is_enabled_by_aid[aid.name]
     if aid == MAG:
+        # R depends on the parameter of each filter. R of optical flow is logged
         sigma_gauss = np.maximum(batch.parameters[MAG.noise], MIN_MAGNETOMETER_SIGMA_GAUSS)
         mean_samples.noise[:] = sigma_gauss**2
     return mean_samples
@@ -595,15 +635,18 @@ class _FusionDecisions:
         now_s, action = self.time_s[event], self.sample_actions[event]
         is_reset_logged = self.logged_resets[event]
         self.last_velocity_s = np.where(is_velocity_fused, now_s, self.last_velocity_s)
+        # 1. Fuse, reject, or start fusion
         may_fuse = action == FUSE
         is_rejected = self.has_gate & may_fuse & self._find_rejected(event, is_outside_gate)
         is_fusion_starting = self.has_gate & (
             (action == START_FUSION) | (self.is_stopped & self.can_start_fusion[event])
         )
         if not (is_reset_logged or (is_rejected | self.is_stopped | is_fusion_starting).any()):
-            # Most samples: no filter rejects the sample, restarts fusion or resets its position
+            # All filters fuse the sample, which is the usual case. The steps below would give the
+            # same result, but take longer
             self.last_position_s = np.where(may_fuse, now_s, self.last_position_s)
             return is_rejected, may_fuse, np.zeros_like(may_fuse), is_velocity_fused
+        # 2. Resets: logged, or computed (start of fusion, or too long without fusion)
         uses_logged_resets = self.uses_logged_decisions & (
             self.is_every_reset_logged
             or is_reset_logged
@@ -619,6 +662,7 @@ class _FusionDecisions:
             is_fusion_starting | is_reset_after_timeout,
         )
         is_fused = may_fuse & ~(is_rejected | self.is_stopped | is_reset)
+        # 3. State of the decisions on later samples
         self.last_position_s = np.where(is_fused | is_reset, now_s, self.last_position_s)
         self.last_velocity_s = np.where(is_reset, now_s, self.last_velocity_s)
         # EKF2 stops fusion if the rejections time out after the last allowed reset
@@ -633,7 +677,11 @@ class _FusionDecisions:
         return is_rejected, is_fused, is_reset, is_velocity_fused & ~is_reset
 
     def _find_rejected(self, event: int, is_outside_gate: BoolArray) -> BoolArray:
-        """Return True for filters that reject the sample, by the log or by the gate."""
+        """Return True for filters that reject the sample.
+
+        Filters that use logged decisions reject a sample if EKF2 rejected it. If this is neither
+        logged nor follows from the logged resets, they use the gate as the other filters.
+        """
         logged_flag = self.logged_rejected_flags[event]
         if not math.isnan(logged_flag):
             return np.asarray(
@@ -641,16 +689,14 @@ class _FusionDecisions:
             )
         if not self.is_every_reset_logged:
             return is_outside_gate
-        # If EKF2 had rejected this sample, its timeout would end before the next sample and reset
-        # the position. Without a logged reset at the next sample, EKF2 has fused this sample
+        # If EKF2 had rejected this sample, it would have reset the position to the next sample
+        # after its timeout. Without a logged reset at the next sample, EKF2 has fused this sample
         next_event = min(event + 1, len(self.time_s) - 1)
-        would_be_reset = (
+        is_timed_out_at_next_sample = (
             self.time_s[next_event] - self.last_position_s > self.fusion_rules.reset_timeout_s
         )
-        is_fused_in_log = (
-            self.uses_logged_decisions & would_be_reset & ~self.logged_resets[next_event]
-        )
-        return np.asarray(is_outside_gate & ~is_fused_in_log)
+        was_fused_in_log = is_timed_out_at_next_sample & ~self.logged_resets[next_event]
+        return np.asarray(is_outside_gate & ~(self.uses_logged_decisions & was_fused_in_log))
 
     def _is_timed_out(self, now_s: Array) -> BoolArray:
         """Return True for filters that reset the position at the next rejection."""
@@ -664,30 +710,31 @@ class _FusionDecisions:
 def estimate_state_correlation(inputs: ReplayInputs, segment: ReplaySegment) -> ReplaySegment:
     """Estimate the correlations of the initial state by a replay of the preceding seconds.
 
-    The log contains only the variances.
+    The log contains only the variances. Without preceding seconds, the correlations are those of
+    the steady state.
     """
-    first_segment = segment.preceding_segment or segment
-    initial_state_correlation = _compute_steady_state_correlation(first_segment)
-    if first_segment is not segment:
+    if (preceding_segment := segment.preceding_segment) is None:
+        correlation = _compute_steady_state_correlation(segment)
+    else:
+        # Vision in addition to GNSS adds no states: it is omitted here
         inputs = replace(inputs, vision_positions=None)
         configuration = FilterConfiguration(inputs.settings)
-        first_segment = replace(first_segment, initial_state_correlation=initial_state_correlation)
+        preceding_segment = replace(
+            preceding_segment,
+            initial_state_correlation=_compute_steady_state_correlation(preceding_segment),
+        )
         intervals = make_event_intervals(
-            inputs, first_segment, configuration.compute_delays(inputs)
+            inputs, preceding_segment, configuration.compute_delays(inputs)
         )
-        run = run_segment(inputs, first_segment, [configuration], [intervals])
-        initial_state_correlation = _compute_correlation(run.covariance[0])
+        run = run_segment(inputs, preceding_segment, [configuration], [intervals])
+        correlation = _compute_correlation(run.covariance[0])
     if segment.magnetic_field is not None:
-        # EKF2 has just reset heading and magnetic fields, so their errors are uncorrelated with all
-        # other states and with each other
-        initial_state_correlation = block_diag(
-            initial_state_correlation[:STATE_COUNT, :STATE_COUNT],
-            np.eye(len(segment.state) - STATE_COUNT),
-        )
-        initial_state_correlation[HEADING] = 0.0
-        initial_state_correlation[:, HEADING] = 0.0
-        initial_state_correlation[HEADING, HEADING] = 1.0
-    return replace(segment, initial_state_correlation=initial_state_correlation)
+        # EKF2 has just reset heading and magnetic fields, so they are uncorrelated. The magnetic
+        # fields are states only from the start of this segment on
+        correlation[HEADING] = correlation[:, HEADING] = 0.0
+        correlation[HEADING, HEADING] = 1.0
+        correlation = block_diag(correlation, np.eye(len(segment.state) - STATE_COUNT))
+    return replace(segment, initial_state_correlation=correlation)
 
 
 def _compute_correlation(P: Array) -> Array:
@@ -703,21 +750,21 @@ def _compute_steady_state_correlation(segment: ReplaySegment) -> Array:
     and the error due to accelerometer bias. The two state errors are correlated, so that their
     effects on the acceleration cancel.
     """
+    # The bias states are in the body frame: rotate them to NED. The variance of a sum of
+    # independent errors, Σ r e, is Σ r² σ²
     state_rotation_to_ned = np.eye(STATE_COUNT)
     state_rotation_to_ned[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = segment.body_to_ned[0]
     P = np.diag(state_rotation_to_ned**2 @ segment.variance[:STATE_COUNT])
-    # A tilt about north accelerates the vehicle to the east, a tilt about east to the south
-    for tilt_state, bias_state, acceleration_per_rad in (
-        (1, ACCELEROMETER_BIAS_NORTH, -GRAVITY_MAGNITUDE_M_S2),
-        (0, ACCELEROMETER_BIAS_EAST, GRAVITY_MAGNITUDE_M_S2),
+    # A tilt error θ about north gives an acceleration error of g θ to the east, a tilt error about
+    # east -g θ to the north. A bias error b gives -b
+    for tilt, bias, acceleration_per_rad in (
+        (TILT_ABOUT_EAST, ACCELEROMETER_BIAS_NORTH, -GRAVITY_MAGNITUDE_M_S2),
+        (TILT_ABOUT_NORTH, ACCELEROMETER_BIAS_EAST, GRAVITY_MAGNITUDE_M_S2),
     ):
-        # The acceleration due to the tilt error and the accelerometer bias error are correlated.
-        # Their covariance is the smaller of their two variances
-        common_variance = min(
-            P[tilt_state, tilt_state] * acceleration_per_rad**2, P[bias_state, bias_state]
-        )
-        P[tilt_state, bias_state] = common_variance / acceleration_per_rad
-        P[bias_state, tilt_state] = P[tilt_state, bias_state]
+        # acceleration_per_rad · θ and b cancel, so they have a common part. Its variance is the
+        # smaller of both variances: cov(acceleration_per_rad · θ, b)
+        common_variance = min(P[tilt, tilt] * acceleration_per_rad**2, P[bias, bias])
+        P[tilt, bias] = P[bias, tilt] = common_variance / acceleration_per_rad
     return _compute_correlation(state_rotation_to_ned.T @ P @ state_rotation_to_ned)
 
 
@@ -731,8 +778,9 @@ def _make_start_state(batch: FilterBatch, bad_acceleration_flag: BadAcceleration
     x = np.tile(segment.state, (filter_count, 1))
     sigma = np.sqrt(segment.variance)
     P = np.tile(sigma[:, None] * segment.initial_state_correlation * sigma, (filter_count, 1, 1))
+    # States that a filter does not estimate: constant, with variance 0. The attitude is then the
+    # nominal attitude. The accelerometer bias is zero, so the bias error is -nominal bias
     zeros = np.zeros((filter_count, 3))
-    # Without the bias states, the accelerometer bias is zero: bias error = -nominal bias
     bias_error_m_s2 = zeros - segment.accelerometer_bias_m_s2
     for rows, is_estimated, value in (
         (THETA, batch.estimates_attitude, zeros),
@@ -772,6 +820,7 @@ def _compute_noise_for_target_variance(P: Array, row: int, target_variance: Arra
 
 def _limit_bias_variance(P: Array, lower_limit_m2_s4: float, estimates_biases: BoolArray) -> None:
     """Limit the accelerometer bias variance like PX4 up to v1.14 (fixCovarianceErrors)."""
+    # A view of P: the assignment at the end changes P
     accelerometer_bias_variance = _get_state_variances(P)[:, ACCELEROMETER_BIAS]
     min_variance = np.maximum(
         MIN_RATIO_TO_LARGEST_BIAS_VARIANCE * accelerometer_bias_variance.max(axis=1, keepdims=True),
@@ -796,17 +845,21 @@ def _collect_measurements(batch: FilterBatch) -> ArrayPair:
         return np.asarray((body_to_ned @ sensor_offset_m[:, :, None])[..., 0])
 
     def limit_variance(reported_variance: Array, noise_parameter: str) -> Array:
+        """Return R: EKF2 uses the noise parameter as the minimum σ."""
         min_sigma = np.maximum(parameters[noise_parameter], MIN_MEASUREMENT_NOISE_SIGMA)
         return np.asarray(np.maximum(reported_variance, min_sigma[:, None] ** 2))
 
+    # 1. Position of the IMU: measured position of the sensor minus lever arm
     body_to_ned = segment.body_to_ned[event_steps]
     measured_values[..., 3:] = received_positions.position_m[samples] - rotate_offset(body_to_ned)
     uses_reported_noise = batch.uses_reported_noise
     if aid.noise_mode_parameter:
         uses_reported_noise = uses_reported_noise & (parameters[aid.noise_mode_parameter] != 1.0)
+    # An unused reported variance counts as 0, so R is determined by the parameter
     measurement_variance[..., 3:] = limit_variance(
         received_positions.variance_m2[samples] * uses_reported_noise[:, None], aid.noise
     )
+    # 2. Velocity, if the source measures it
     if (
         received_positions.velocity_m_s is not None
         and received_positions.velocity_variance_m2_s2 is not None
@@ -822,6 +875,7 @@ def _collect_measurements(batch: FilterBatch) -> ArrayPair:
         measurement_variance[..., :3] = GNSS_VELOCITY_VARIANCE_FACTORS * limit_variance(
             received_positions.velocity_variance_m2_s2[samples], GNSS_VEL.noise
         )
+    # 3. GNSS heights have a larger minimum σ
     if aid == GNSS_POS:
         measurement_variance[..., DOWN_COLUMN] = np.maximum(
             measurement_variance[..., DOWN_COLUMN],

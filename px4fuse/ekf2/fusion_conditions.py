@@ -281,24 +281,25 @@ def _check_position_quality(positions: UnfusedPositions) -> Iterator[UnmetCondit
     if min_quality <= 0.0 or "quality" not in status:
         return
     quality = positions.select_samples(status)["quality"]
-    # EKF2 also checks the quality of the previous sample and of the newest sample
+    # EKF2 starts fusion if all samples from the fused (delayed) to the newest, and the sample
+    # before, have the minimum quality. A shorter span without fusion needs all of its samples
     sample_count = int(np.ceil(positions.max_sample_age_s / positions.interval_s)) + 2
     has_min_quality = (quality >= min_quality).astype(float)
-    if has_min_quality.rolling(min(sample_count, max(len(quality), 1))).min().max() == 1.0:
+    have_all_min_quality = has_min_quality.rolling(min(sample_count, max(len(quality), 1))).min()
+    if (have_all_min_quality == 1.0).any():
         return
     median_quality = float(quality.median())
     reason = (
         f"{100.0 * (1.0 - has_min_quality.mean()):.0f} % of {len(quality)} positions have a "
         "quality below EKF2_EV_QMIN."
     )
-    action = (
-        "Improve light and texture in the camera view, or fly slower. Set EKF2_EV_QMIN to "
-        f"{max(median_quality, 0.0):.0f} only if the positions are correct."
-    )
-    if not quality.any():
-        reason = (
-            f"{reason} MAVLink VISION_POSITION_ESTIMATE contains no quality, so EKF2 assumes 0."
+    if quality.any():
+        action = (
+            "Improve light and texture in the camera view, or fly slower. Set EKF2_EV_QMIN to "
+            f"{max(median_quality, 0.0):.0f} only if the positions are correct."
         )
+    else:
+        reason += " MAVLink VISION_POSITION_ESTIMATE contains no quality, so EKF2 assumes 0."
         action = "Send the quality field of MAVLink ODOMETRY, or set EKF2_EV_QMIN to 0."
     fault = f"the quality is {median_quality:.0f}, below EKF2_EV_QMIN {min_quality:.0f}"
     yield UnmetCondition("quality", fault, reason, action)
@@ -358,27 +359,27 @@ def _check_gnss(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     parameters = positions.parameters
     # Bit n of EKF2_GPS_CHECK enables check n + 1 of GNSS_CHECKS; check 0 (fix) is always enabled
     checked_mask = int(parameters.get("EKF2_GPS_CHECK", -1)) << 1 | 1
-    failed_fraction_by_bit = {
-        bit: fraction
-        for bit in range(len(GNSS_CHECKS))
+    failed_checks = [
+        (fraction, *check)
+        for bit, check in enumerate(GNSS_CHECKS)
         if checked_mask >> bit & 1
         and (fraction := positions.compute_status_bit_fraction("failed_checks", bit))
         > MIN_GNSS_CHECK_FAILURE_FRACTION
-    }
-    if not failed_fraction_by_bit:
+    ]
+    if not failed_checks:
         return
-    failed_bits = sorted(failed_fraction_by_bit, key=lambda bit: -failed_fraction_by_bit[bit])
+    # Most frequent failures first
+    failed_checks.sort(key=lambda check: -check[0])
     check_texts = []
-    for bit in failed_bits[:3]:
-        name, parameter, unit = GNSS_CHECKS[bit]
-        failed_percent = 100.0 * failed_fraction_by_bit[bit]
+    for fraction, name, parameter, unit in failed_checks[:3]:
+        failed_percent = 100.0 * fraction
         limit_text = ""
         if parameter in parameters:
             limit_text = f", limit {parameter} {parameters[parameter]:g}{unit}"
         check_texts.append(f"{name} (failed {failed_percent:.0f} % of the time{limit_text})")
     yield UnmetCondition(
         "checks",
-        f"GNSS fails EKF2's check of the {GNSS_CHECKS[failed_bits[0]][0]}",
+        f"GNSS fails EKF2's check of the {failed_checks[0][1]}",
         f"Failed checks: {'; '.join(check_texts)}. EKF2 starts to fuse GNSS after "
         f"{parameters.get('EKF2_REQ_GPS_H', 10.0):g} s without a failure.",
         "Give the antenna a free view of the sky, and take off only after EKF2 fuses GNSS.",

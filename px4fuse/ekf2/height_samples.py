@@ -40,9 +40,10 @@ def add_heights(
 ) -> tuple[ReplaySegment, ...] | str:
     """Add height measurements to the replay, or return the reason why this is impossible."""
     parameters = fusion_record.parameters
-    replayed_times_s = np.concatenate([segment.time_s for segment in segments])
     if uses_aid_mask(parameters):
         return "EKF2 before PX4 v1.14 fuses only one height sensor"
+    # 1. Fused height sensors, and height reference
+    replayed_times_s = np.concatenate([segment.time_s for segment in segments])
     enabled_fractions = {
         name: np.mean(sample_step_function(aid_log.enabled, replayed_times_s) > 0.0)
         for name, aid_log in ekf2.aids.items()
@@ -59,8 +60,7 @@ def add_heights(
         (reference,) = fused_aids
     if reference not in fused_aids:
         return "EKF2's height reference is neither GNSS nor barometer, or not logged"
-    # The other height sensor, if any: EKF2 estimates its bias relative to the height reference
-    other_aids = {*fused_aids} - {reference}
+    # 2. Barometer samples
     barometer_samples = pd.DataFrame(columns=["down_m", "weight"], dtype=float)
     if BAROMETER.name in fused_aids and flight.barometer is not None:
         # EKF2 subtracts half a prediction step from the sample times
@@ -69,15 +69,19 @@ def add_heights(
         barometer_samples = find_fused_barometer_samples(ekf2, fusion_record, barometer_down_m)
     barometer_samples["down_m"] += fusion_record.altitude_m
     sample_times_s = barometer_samples.index.to_numpy(float)
+    # The dead zone is 0 outside ground effect
     barometer_samples["dead_zone_m"] = fusion_record.was_flag_set(
         GROUND_EFFECT_FLAG, sample_times_s
     ) * parameters.get("EKF2_GND_EFF_DZ", DEFAULT_GROUND_EFFECT_DEAD_ZONE_M)
+    # 3. Initial bias, barometer samples and initial height of each segment
     segments_with_heights = []
     delayed_down_m = fusion_record.delayed_state["down_m"]
     for segment in segments:
         start_s = float(segment.time_s[0])
         bias_and_variance = np.zeros(2)
-        for name in other_aids:
+        if len(fused_aids) > 1:
+            # EKF2 estimates the bias of the sensor that is not the reference
+            (name,) = {*fused_aids} - {reference}
             bias = fusion_record.height_bias_updates.get(name)
             if bias is None or not bias.index[0] - MAX_BIAS_LOG_DELAY_S < start_s < bias.index[-1]:
                 return f"EKF2's estimate of the {AIDS[name].label} bias is not logged"

@@ -74,27 +74,30 @@ class BadAccelerationFlag:
             logged_flag = np.zeros(len(time_s), bool)
         self.uses_logged_flag = uses_logged_flag
         self.flag_duration_s = flag_duration_s
-        # Start and end (s) of each logged time span in which EKF2 flags a bad acceleration; the
-        # last span may have no end
+        # Start and end (s) of each logged time with a set flag. Changes of the flag are start, end,
+        # start, end, and so on. A flag that is still set at the end has the end infinity
         flag_change_steps = np.flatnonzero(np.diff(logged_flag, prepend=False, append=False))
         self.logged_spans_s = np.append(time_s, np.inf)[flag_change_steps].reshape(-1, 2)
         self.since_s = np.full(len(uses_logged_flag), time_s[0])
-        # If the flag is set at the start of the segment, it remains set for flag_duration_s
-        self.until_s = self.since_s + flag_duration_s * float(logged_flag[0])
+        self.until_s = self.since_s.copy()
+        if logged_flag[0]:
+            # The start of the flag is before the segment: assume that it is the first step
+            self.until_s += flag_duration_s
+
+    def apply_logged_flag(self, now_s: Array) -> None:
+        """Set ``since_s`` and ``until_s`` to the latest logged time with a set flag before now.
+
+        Only configurations that use the logged flag are changed.
+        """
+        if len(self.logged_spans_s):
+            latest_row = np.searchsorted(self.logged_spans_s[:, 0], now_s) - 1
+            selected = self.uses_logged_flag & (latest_row >= 0)
+            self.since_s[selected], self.until_s[selected] = self.logged_spans_s[
+                latest_row[selected]
+            ].T
 
     def compute_bad_acceleration_fraction(self, begin_s: Array, end_s: Array) -> Array:
-        """Return the fraction of a time interval with a bad acceleration, for each configuration.
-
-        Call this method in time order.
-        """
-        # Filters that use the logged flag: select the latest logged span that begins before the end
-        # of the interval
-        if len(self.logged_spans_s):
-            last_row = np.searchsorted(self.logged_spans_s[:, 0], end_s) - 1
-            is_flag_from_log = self.uses_logged_flag & (last_row >= 0)
-            self.since_s[is_flag_from_log], self.until_s[is_flag_from_log] = self.logged_spans_s[
-                last_row[is_flag_from_log]
-            ].T
+        """Return the fraction of a time interval with a set flag, for each configuration."""
         if not (self.until_s > begin_s).any():
             return np.zeros_like(self.until_s)
         overlap_s = np.minimum(self.until_s, end_s) - np.maximum(self.since_s, begin_s)
@@ -122,11 +125,14 @@ class BadAccelerationFlag:
         for sample in previous_barometer:
             latest_barometer = np.where(np.isnan(sample), latest_barometer, sample)
         is_acceleration_bad = _has_large_height_innovations(latest_barometer, previous_gnss)
+        # 2. After each barometer sample of this event. Its GNSS sample is not yet fused
         for sample in barometer:
             latest_barometer = np.where(np.isnan(sample), latest_barometer, sample)
             is_acceleration_bad |= _has_large_height_innovations(latest_barometer, previous_gnss)
+        # 3. After the GNSS sample of this event
         is_acceleration_bad |= _has_large_height_innovations(latest_barometer, gnss)
         is_acceleration_bad &= ~self.uses_logged_flag
+        # A flag that is still set continues: only its end changes
         self.since_s = np.where(is_acceleration_bad & (self.until_s < time_s), time_s, self.since_s)
         self.until_s = np.where(is_acceleration_bad, time_s + self.flag_duration_s, self.until_s)
 
@@ -151,7 +157,8 @@ class HeightFilter:
 
     Parameters
     ----------
-    has_gnss_fix : ndarray of bool, shape (events, filters)
+    has_gnss_fix, gnss_down_m : ndarray, shape (events, filters)
+        True for a GNSS fix, and its height (positive down).
 
     Attributes
     ----------
@@ -169,6 +176,7 @@ class HeightFilter:
         self,
         batch: FilterBatch,
         has_gnss_fix: BoolArray,
+        gnss_down_m: Array,
         bad_acceleration_flag: BadAccelerationFlag,
     ) -> None:
         self.bad_acceleration_flag = bad_acceleration_flag
@@ -190,11 +198,14 @@ class HeightFilter:
                 for end_steps in batch.event_steps.T
             ]
         )
-        self.barometer_sample_count = barometer_samples.shape[1]
+        # Index of the GNSS sample, after the barometer samples of each event
+        self.gnss_index = barometer_samples.shape[1]
+        # Append a sample for GNSS, which is measured at the event (age 0)
         self.down_m, self.age_s, self.time_s, self.dead_zone_m, weight, has_sample = np.pad(
             barometer_samples, ((0, 0), (0, 1), (0, 0), (0, 0))
         )
-        self.time_s[-1] = batch.events["time_s"]
+        self.down_m[-1], self.time_s[-1] = gnss_down_m, batch.events["time_s"]
+        # GNSS samples and padding have the weight 1
         self.weight = np.maximum(weight, 1.0)
         self.has_sample = (has_sample > 0.0) & batch.is_enabled_by_aid[BAROMETER.name]
         if GNSS_HGT.name in self.fused_sensors:
@@ -218,9 +229,7 @@ class HeightFilter:
         ).T
         self.bias = BiasEstimator(bias_m, bias_variance_m2, segment.step_s)
         self.last_sample_s = np.full(filter_count, segment.time_s[0])
-        self.update_records = np.full(
-            (event_count, self.barometer_sample_count + 2, 4, filter_count), np.nan
-        )
+        self.update_records = np.full((event_count, self.gnss_index + 2, 4, filter_count), np.nan)
 
     def make_update_table(
         self, sensor: str, configuration_index: int, end_s: Array
@@ -229,8 +238,10 @@ class HeightFilter:
 
         ``end_s`` contains the time (s) of each event.
         """
-        count = self.barometer_sample_count
-        samples = slice(count, count + 1) if sensor == GNSS_HGT.name else slice(count)
+        # The barometer samples are before the GNSS sample
+        samples = slice(self.gnss_index)
+        if sensor == GNSS_HGT.name:
+            samples = slice(self.gnss_index, self.gnss_index + 1)
         return make_update_table(
             self.update_records[:, samples, :, configuration_index],
             self.time_s[samples, :, configuration_index].T,
@@ -239,18 +250,12 @@ class HeightFilter:
         )
 
     def fuse_barometer(self, event: int, x: Array, P: Array) -> ArrayPair:
-        for sample_index in range(self.barometer_sample_count):
+        for sample_index in range(self.gnss_index):
             x, P = self._fuse_sample(BAROMETER, event, sample_index, x, P, self.R_m2)
         return x, P
 
-    def fuse_gnss(
-        self, event: int, x: Array, P: Array, gnss_down_m: Array, gnss_variance_m2: Array
-    ) -> ArrayPair:
-        """Fuse the GNSS height (m, down) of one event with its R (m²); return x and P."""
-        self.down_m[-1, event] = gnss_down_m
-        return self._fuse_sample(
-            GNSS_HGT, event, self.barometer_sample_count, x, P, gnss_variance_m2
-        )
+    def fuse_gnss(self, event: int, x: Array, P: Array, R: Array) -> ArrayPair:
+        return self._fuse_sample(GNSS_HGT, event, self.gnss_index, x, P, R)
 
     def update_bad_acceleration_flag(
         self, event: int, time_s: Array, velocity_down_update: Array
@@ -260,11 +265,15 @@ class HeightFilter:
         ``velocity_down_update``, shape (2, filters), contains ν and S of the GNSS velocity.
         """
         self.update_records[event, -1, :2] = velocity_down_update
-        update_records = self.update_records[max(event - 1, 0) : event + 1]
-        innovations = -update_records[:, :, 0] / np.sqrt(update_records[:, :, 1])
+        # Previous and this event; for the first event, twice this event
+        records = self.update_records[[max(event - 1, 0), event]]
+        # ν / √S, positive upwards. ν and S are the first two rows of a record
+        innovations = -records[:, :, 0] / np.sqrt(records[:, :, 1])
         if (innovations > MIN_HEIGHT_INNOVATION_SIGMAS_OF_ONE_SENSOR).any():
+            # The last two columns are GNSS height and GNSS velocity. EKF2 uses the larger
+            # innovation; a missing one is NaN
             innovations[:, -2] = np.fmax(innovations[:, -2], innovations[:, -1])
-            self.bad_acceleration_flag.update(time_s, innovations[0, :-1], innovations[-1, :-1])
+            self.bad_acceleration_flag.update(time_s, *innovations[:, :-1])
 
     def _fuse_sample(
         self, aid: Aid, event: int, sample_index: int, x: Array, P: Array, R: Array
@@ -274,23 +283,26 @@ class HeightFilter:
             return x, P
         sample = sample_index, event
         has_sample, age_s, time_s = self.has_sample[sample], self.age_s[sample], self.time_s[sample]
-        # The sample measured an earlier height: height - age_s · vertical velocity
+        # 1. Innovation. The sample measured an earlier height: height - age_s · vertical velocity
         PH = P[:, :, POSITION_DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
         predicted_variance = PH[:, POSITION_DOWN] - age_s * PH[:, VELOCITY_DOWN]
         nu = self.down_m[sample] - x[:, POSITION_DOWN] + age_s * x[:, VELOCITY_DOWN]
         weight = self.weight[sample]
+        # 2. Bias of the sensor that is not the height reference
         if aid.name != self.reference:
-            last_sample_s = self.last_sample_s
+            previous_sample_s = self.last_sample_s
             self.last_sample_s = np.where(
-                has_sample, np.maximum(last_sample_s, time_s), last_sample_s
+                has_sample, np.maximum(previous_sample_s, time_s), previous_sample_s
             )
+            # Without the reference, EKF2 holds the bias constant
             is_bias_updated = has_sample & self.is_reference_enabled[event]
-            interval_s = (self.last_sample_s - last_sample_s) * is_bias_updated
+            interval_s = (self.last_sample_s - previous_sample_s) * is_bias_updated
             nu, R = self.bias.remove_and_update_bias(
                 nu, predicted_variance, R, interval_s, is_bias_updated, weight
             )
         # In ground effect, the measured height is too low: EKF2 reduces a positive innovation
         nu = nu - np.minimum(np.maximum(nu, 0.0), self.dead_zone_m[sample])
+        # 3. Gate
         S = predicted_variance + R
         gate_squared = self.gate_squared[aid.name]
         is_fused = has_sample & (nu * nu <= gate_squared * S)

@@ -61,10 +61,12 @@ ANALYSIS_NAME = "EKF2 replay"
 SIMULATED_EKF2_NOTE = (
     "EKF2 in this log is px4fuse's model of EKF2, run on the simulated sensors, not PX4's EKF2"
 )
-# Logging interval (s) of the EKF2 topics that repeat the vision positions (logged_topics.cpp)
-LOGGING_INTERVAL_BY_VISION_TOPIC_S = {
-    "estimator_visual_odometry_aligned": 0.2,
-    "estimator_aid_src_ev_pos": 0.5,
+# Maximum median interval (s) of the EKF2 topics that repeat the vision positions. The default
+# profile logs them every 0.2 s and 0.5 s (logged_topics.cpp); a shorter interval means that the log
+# contains all positions
+MAX_INTERVAL_BY_VISION_TOPIC_S = {
+    "estimator_visual_odometry_aligned": 0.18,
+    "estimator_aid_src_ev_pos": 0.25,
 }
 # Bit of EKF2_AID_MASK that rotates vision positions (PX4 v1.13 and earlier)
 ROTATE_VISION_BIT = 64
@@ -86,8 +88,6 @@ MAX_IMU_INTERVAL_S = 0.012
 MAX_MISSING_IMU_FRACTION = 0.1
 # First PX4 release with the time of the fusion horizon in estimator_states
 FIRST_RELEASE_WITH_HORIZON_TIMES = "PX4 v1.13"
-# Value of FusionRules.max_resets for an unlimited number of successive resets
-NO_RESET_LIMIT = 1_000_000
 # Maximum time (s) between two fusions of height and heading during a gap of the position source
 MAX_HEIGHT_FUSION_INTERVAL_IN_POSITION_GAP_S = 0.25
 
@@ -143,7 +143,7 @@ class FusionRules:
     reset_timeout_s : float
         EKF2 resets its position if it rejects all samples for this time.
     max_resets : int
-        EKF2 stops fusion after this number of successive resets.
+        EKF2 stops fusion after this number of successive resets; by default unlimited.
     min_accelerometer_bias_variance_m2_s4 : float or None
         Minimum accelerometer bias variance (m²/s⁴).
     is_horizon_set_by_largest_delay : bool
@@ -156,10 +156,10 @@ class FusionRules:
         Time for which the flag for a bad acceleration stays set.
     """
 
-    max_sample_interval_to_start_s: float
-    stop_timeout_s: float
-    reset_timeout_s: float
-    max_resets: int
+    max_sample_interval_to_start_s: float = np.inf
+    stop_timeout_s: float = np.inf
+    reset_timeout_s: float = 7.0
+    max_resets: int = 1_000_000
     min_accelerometer_bias_variance_m2_s4: float | None = None
     is_horizon_set_by_largest_delay: bool = False
     reset_variance_factor: float = 1.0
@@ -173,14 +173,7 @@ VISION_RULES = FusionRules(
     max_sample_interval_to_start_s=0.2, stop_timeout_s=0.4, reset_timeout_s=1.0, max_resets=5
 )
 # Rules for GNSS in PX4 v1.16 (resetHorizontalPositionTo, gps_control.cpp)
-GNSS_RULES = FusionRules(
-    max_sample_interval_to_start_s=np.inf,
-    stop_timeout_s=np.inf,
-    reset_timeout_s=7.0,
-    max_resets=NO_RESET_LIMIT,
-    reset_variance_factor=2.0,
-    resets_velocity=True,
-)
+GNSS_RULES = FusionRules(reset_variance_factor=2.0, resets_velocity=True)
 
 
 @dataclass(frozen=True)
@@ -226,7 +219,7 @@ class ReplayInputs:
     vision_positions: ReceivedPositions | None = None
 
 
-def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
+def prepare_inputs(  # noqa: PLR0911, PLR0912, PLR0915 (one return per reason)
     flight: Flight, omitted_aids: Mapping[str, str] = {}
 ) -> ReplayInputs | Unavailable:
     """Return the inputs of the EKF2 replay, or the reason why the log is insufficient.
@@ -240,13 +233,13 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         return attitude
     if isinstance(ekf2, Unavailable):
         return ekf2
+    # 1. Position source, and data without which no replay is possible
     aid = find_replayed_position_source(ekf2)
     is_gnss = aid == GNSS_POS
     logged_ekf2 = ekf2
     if is_gnss:
         ekf2 = replace_vision_by_gnss_innovations(ekf2)
     fusion_record = ekf2.record
-    horizon_s = ekf2.horizon_s
     if isinstance(fusion_record, Unavailable):
         return fusion_record
     # Without a latitude, the model omits earth rotation, which simulated flights do not contain
@@ -255,25 +248,20 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
         return innovations
     flow_samples = fusion_record.flow if is_gnss else pd.DataFrame()
-    modelled_aid_labels = [GNSS_POS.label, GNSS_VEL.label] if is_gnss else []
-    modelled_aid_labels += [FLOW.label] if len(flow_samples) else []
-    if unmodelled_aids := [
-        label for label in fusion_record.other_horizontal_aids if label not in modelled_aid_labels
-    ]:
-        return Unavailable(
-            ANALYSIS_NAME,
-            f"EKF2 also fused {', '.join(unmodelled_aids)}, which the replay does not contain",
-            "Before the next flight, disable optical flow (EKF2_OF_CTRL 0), "
-            f"{'' if is_gnss else 'GNSS (EKF2_GPS_CTRL 0) '}"
-            "or vision velocity (bit 2 of EKF2_EV_CTRL).",
-        )
-    if missing_imu := _explain_missing_imu(imu.index.to_numpy()):
-        return missing_imu
-    received_positions = (
-        read_gnss(flight, ekf2, fusion_record)
-        if is_gnss
-        else read_vision(flight, ekf2, fusion_record, attitude)
-    )
+    if missing := _explain_unmodelled_aids(
+        fusion_record, is_gnss, len(flow_samples) > 0
+    ) or _explain_missing_imu(imu.index.to_numpy()):
+        return missing
+    # 2. Positions that EKF2 received
+    vision_positions = None
+    if is_gnss:
+        received_positions = read_gnss(flight, ekf2, fusion_record)
+        if EV_POS.name not in omitted_aids and not isinstance(received_positions, Unavailable):
+            vision_positions = _read_vision_in_gnss_flight(
+                flight, logged_ekf2, fusion_record, attitude
+            )
+    else:
+        received_positions = read_vision(flight, ekf2, fusion_record, attitude)
     if isinstance(received_positions, Unavailable):
         return received_positions
     if not len(received_positions.timestamp_s):
@@ -282,22 +270,14 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
             f"EKF2 reports fusion of {aid.label}, but the log contains no sample of this source",
             "Record estimator_status_flags and the position source for the whole flight.",
         )
-    vision_positions = (
-        _read_vision_in_gnss_flight(flight, logged_ekf2, fusion_record, attitude)
-        if is_gnss and EV_POS.name not in omitted_aids
-        else None
-    )
     if isinstance(vision_positions, Unavailable):
         return vision_positions
-    lever_arm = {}
-    if is_gnss and (gnss_track := _find_gnss_track(flight)):
-        # Since PX4 v1.17, GNSS messages contain the lever arm of the receiver
-        lever_arm = dict(zip(aid.lever_arm, gnss_track.lever_arm_m, strict=True))
-    if isinstance(horizon_s, Unavailable):
+    if isinstance(horizon_s := ekf2.horizon_s, Unavailable):
         if not flight.log.firmware.startswith(FIRST_RELEASE_WITH_HORIZON_TIMES):
             return horizon_s
         # If EKF2_EV_DELAY is at most one prediction step, EKF2 fuses without delay
         horizon_s = 0.0
+    # 3. Parts of the flight without gaps, with the samples of further sensors
     aiding_times_s = received_positions.timestamp_s
     if len(flow_samples) and FLOW.name not in omitted_aids:
         aiding_times_s = np.union1d(aiding_times_s, flow_samples.index)
@@ -326,16 +306,21 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
             reason_to_use_logged_height = segments_with_heights
         else:
             segments = segments_with_heights
+    # 4. Parameters of the fused aiding sources
+    fused_aids = [aid]
+    if vision_positions is not None:
+        fused_aids.append(EV_POS)
+    if any(segment.magnetic_field for segment in segments):
+        fused_aids.append(MAG)
     height_samples = segments[0].height_samples
-    is_other_aid_fused = {
-        EV_POS: vision_positions is not None,
-        MAG: any(segment.magnetic_field for segment in segments),
-        BAROMETER: height_samples and BAROMETER.name in height_samples.fused_sensors,
-    }
-    other_aids = [other_aid for other_aid, is_fused in is_other_aid_fused.items() if is_fused]
+    if height_samples and BAROMETER.name in height_samples.fused_sensors:
+        fused_aids.append(BAROMETER)
+    settings = fill_parameters_with_defaults(fusion_record.parameters, *fused_aids)
+    if is_gnss and (gnss_track := _find_gnss_track(flight)):
+        # Since PX4 v1.17, GNSS messages contain the lever arm of the receiver
+        settings |= dict(zip(aid.lever_arm, gnss_track.lever_arm_m, strict=True))
     return ReplayInputs(
-        settings=fill_parameters_with_defaults(fusion_record.parameters, aid, *other_aids)
-        | lever_arm,
+        settings=settings,
         segments=segments,
         received_positions=received_positions,
         rules=_make_fusion_rules(fusion_record, ekf2.step_s, is_gnss=is_gnss),
@@ -354,6 +339,24 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         aid=aid,
         reason_to_use_logged_height=reason_to_use_logged_height,
         vision_positions=vision_positions,
+    )
+
+
+def _explain_unmodelled_aids(
+    fusion_record: FusionRecord, is_gnss: bool, has_flow: bool
+) -> Unavailable | None:
+    modelled_labels = [GNSS_POS.label, GNSS_VEL.label] * is_gnss + [FLOW.label] * has_flow
+    unmodelled_labels = [
+        label for label in fusion_record.other_horizontal_aids if label not in modelled_labels
+    ]
+    if not unmodelled_labels:
+        return None
+    return Unavailable(
+        ANALYSIS_NAME,
+        f"EKF2 also fused {', '.join(unmodelled_labels)}, which the replay does not contain",
+        "Before the next flight, disable optical flow (EKF2_OF_CTRL 0), "
+        f"{'' if is_gnss else 'GNSS (EKF2_GPS_CTRL 0) '}"
+        "or vision velocity (bit 2 of EKF2_EV_CTRL).",
     )
 
 
@@ -390,17 +393,14 @@ def _make_fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: b
         # PX4 with EKF2_GPS_MODE (main of 2026) does not reset velocity with position
         fusion_rules = replace(GNSS_RULES, resets_velocity=GNSS_MODE_PARAMETER not in parameters)
         if not fusion_record.stores_latitude():
-            # The flag for a bad acceleration stays set for 10 s (BADACC_PROBATION, common.h)
+            # Before PX4 v1.16. The flag for a bad acceleration stays set for 10 s
+            # (BADACC_PROBATION, common.h)
             fusion_rules = replace(
                 fusion_rules, reset_variance_factor=1.0, bad_acceleration_flag_duration_s=10.0
             )
     elif uses_aid_mask(parameters):
-        fusion_rules = FusionRules(
-            max_sample_interval_to_start_s=np.inf,
-            stop_timeout_s=7.0,
-            reset_timeout_s=7.0,
-            max_resets=NO_RESET_LIMIT,
-        )
+        # External vision before PX4 v1.14
+        fusion_rules = FusionRules(stop_timeout_s=7.0)
     return replace(
         fusion_rules,
         # EKF2 up to v1.14 has a lower limit (5e-8 m²/s²) for the variance of the velocity change
@@ -451,17 +451,18 @@ def read_gnss(
         )
     parameters = fusion_record.parameters
     gnss_control_bits = int(parameters.get(GNSS_POS.switch, 7.0))
+    # 1. Fixes. EKF2 ignores GNSS fixes while GNSS is disabled
     position_samples, velocity_samples = track.samples, track.velocity
-    # EKF2 ignores GNSS fixes while GNSS is disabled
     if (enabled_changes := ekf2.aids[GNSS_POS.name].enabled) is not None:
         is_enabled = sample_step_function(enabled_changes, position_samples.index) > 0.0
         position_samples = position_samples[is_enabled]
         velocity_samples = velocity_samples[is_enabled]
-    # EKF2_GPS_DELAY is already subtracted from the times of the track. It is added here, because
-    # the replay subtracts it again
+    # 2. Timestamps. EKF2_GPS_DELAY is already subtracted from the times of the track. It is added
+    # here, because the replay subtracts it again
     logged_delay_s = fill_parameters_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
     timestamp_s = position_samples.index.to_numpy() + logged_delay_s
-    # Maximum reported position noise (m) that EKF2 uses (gps_control.cpp)
+    # 3. Reported variances, and velocity. Maximum reported position noise (m) that EKF2 uses:
+    # gps_control.cpp
     max_reported_noise_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
     reported_variance = (
         position_samples[Columns.POSITION_VARIANCE].fillna(0.0).clip(upper=max_reported_noise_m**2)
@@ -471,16 +472,22 @@ def read_gnss(
     if fuses_velocity and velocity_samples[Columns.VELOCITY].notna().all(axis=None):
         velocity = velocity_samples[Columns.VELOCITY].to_numpy()
         velocity_variance = velocity_samples[Columns.VELOCITY_VARIANCE].fillna(0.0).to_numpy()
+    # GNSS is assumed to arrive without delay
+    rejected_flags, is_reset_to_sample = _read_logged_decisions(
+        ekf2, fusion_record, timestamp_s, timestamp_s, GNSS_POS
+    )
     return ReceivedPositions(
-        timestamp_s,
-        timestamp_s,
-        position_samples[Columns.POSITION].to_numpy()
+        timestamp_s=timestamp_s,
+        arrival_s=timestamp_s,
+        # The replay computes positions in EKF2's internal coordinates
+        position_m=position_samples[Columns.POSITION].to_numpy()
         * compute_internal_to_published_position_ratio(fusion_record),
-        reported_variance.to_numpy(),
-        *_read_logged_decisions(ekf2, fusion_record, timestamp_s, timestamp_s, GNSS_POS),
-        track.name,
-        velocity,
-        velocity_variance,
+        variance_m2=reported_variance.to_numpy(),
+        rejected_flags=rejected_flags,
+        is_reset_to_sample=is_reset_to_sample,
+        source=track.name,
+        velocity_m_s=velocity,
+        velocity_variance_m2_s2=velocity_variance,
         uses_sender_timestamps=track.assumed_delay_s == 0.0 and logged_delay_s != 0.0,
     )
 
@@ -499,8 +506,8 @@ def read_vision(
     timestamp_s = position_samples.index.to_numpy()
     position_m = position_samples[Columns.POSITION].to_numpy(copy=True)
     variance_m2 = position_samples[Columns.POSITION_VARIANCE].fillna(0.0).to_numpy(copy=True)
-    # If EKF2 fuses the vision heading, its heading is that of the vision frame. Otherwise, EKF2
-    # rotates the positions to north. Before PX4 v1.14, a parameter decides this
+    # Rotation to NED. If EKF2 fuses the vision heading, its heading is that of the vision frame.
+    # Otherwise, EKF2 rotates the positions to north. Before PX4 v1.14, a parameter decides this
     if uses_aid_mask(fusion_record.parameters):
         aid_mask = int(fusion_record.parameters[AID_MASK_PARAMETER])
         is_rotated_by_ekf2 = aid_mask & ROTATE_VISION_BIT > 0
@@ -516,12 +523,12 @@ def read_vision(
                 "rotate them to NED",
                 "Send the positions in NED, or also send the orientation.",
             )
-        ekf2_attitude, source_attitude = (
-            interpolate_attitude(orientations, timestamp_s)
-            for orientations in (attitude, track.orientation)
-        )
+        ekf2_attitude = interpolate_attitude(attitude, timestamp_s)
+        source_attitude = interpolate_attitude(track.orientation, timestamp_s)
+        # From the vision frame to NED, at each sample
         rotation = to_rotation_matrix(multiply(ekf2_attitude, conjugate(source_attitude)))
         position_m = rotate(rotation, position_m)
+        # Variance of a sum of independent errors: Σ r² σ²
         variance_m2 = rotate(rotation**2, variance_m2)
     vision_age_s = fusion_record.vision_age_s
     # If the arrival times are unknown, no sample is treated as late
@@ -560,6 +567,7 @@ def _read_vision_in_gnss_flight(
     is_vision_disabled = (
         sample_step_function(enabled_changes, received_positions.timestamp_s) == 0.0
     )
+    # The replay computes positions in EKF2's internal coordinates
     position_m = received_positions.position_m * compute_internal_to_published_position_ratio(
         fusion_record
     )
@@ -591,24 +599,17 @@ def _read_logged_decisions(
     earliest_fusion_times_s = np.maximum.accumulate(
         np.maximum(measurement_times_s, arrival_s - horizon_s)
     )
-    # EKF2 rejected all samples from its last fusion (last_fused_s) to the time of the log row
-    last_fusion_times_s = ekf2.aids[aid.name].samples.reindex(columns=["last_fused_s"]).dropna()
-    last_fusion_rows, log_rows = np.searchsorted(
-        earliest_fusion_times_s,
-        np.array([last_fusion_times_s["last_fused_s"], last_fusion_times_s.index])
-        + PREDICTION_STEP_TOLERANCE_S,
+    # 1. Time spans in which EKF2 rejected all samples except the last: from its last fusion
+    # (last_fused_s) to a log row, and dead reckoning, which the last sample ended
+    last_fused_s = ekf2.aids[aid.name].samples.reindex(columns=["last_fused_s"]).dropna()
+    fusion_to_log_row_s = np.column_stack([last_fused_s, last_fused_s.index])
+    dead_reckoning_s = _find_dead_reckoning_spans(ekf2, fusion_record, aid)
+    # First row in each span, and first row after it
+    fusion_to_log_rows, dead_reckoning_rows = (
+        np.searchsorted(earliest_fusion_times_s, spans_s + PREDICTION_STEP_TOLERANCE_S)
+        for spans_s in (fusion_to_log_row_s, dead_reckoning_s)
     )
-    rejection_rows = [*zip(last_fusion_rows, log_rows, strict=True)]
-    # EKF2 also rejected all samples during dead reckoning, except the last, which ended it
-    last_rows_of_dead_reckoning = []
-    if aid == EV_POS:
-        spans_s = _find_dead_reckoning_spans(ekf2, fusion_record)
-        for begin, end in np.searchsorted(
-            earliest_fusion_times_s, spans_s + PREDICTION_STEP_TOLERANCE_S
-        ):
-            rejection_rows.append((begin, end))
-            last_rows_of_dead_reckoning.append(end - 1)
-    for begin, end in rejection_rows:
+    for begin, end in (*fusion_to_log_rows, *dead_reckoning_rows):
         rejected_flags[begin : max(end - 1, 0)] = 1.0
     may_be_reset_sample = np.isnan(rejected_flags)
     # The log contains EKF2's decision (fused or rejected) on some of the samples
@@ -620,38 +621,41 @@ def _read_logged_decisions(
     may_be_reset_sample[is_logged] &= (innovations_of_samples["rejected"] > 0.0) | (
         innovations_of_samples["innovation_m"] == 0.0
     )
-    # A reset is published later than its measurement by the delay of the fusion horizon
+    # 3. Sample of each reset. A reset is published later than its measurement by the delay of the
+    # fusion horizon
     publication_times_s = earliest_fusion_times_s + horizon_s
     for reset_s in find_horizontal_reset_times_s(ekf2):
         is_published_near_reset = (publication_times_s <= reset_s) & (
             publication_times_s > reset_s - MAX_RESET_PUBLICATION_DELAY_S
         )
         reset_rows = np.flatnonzero(is_published_near_reset & may_be_reset_sample)
-        rows_after_dead_reckoning = np.intersect1d(reset_rows, last_rows_of_dead_reckoning)
+        rows_after_dead_reckoning = np.intersect1d(reset_rows, dead_reckoning_rows[:, 1] - 1)
         # If a possible reset sample ended dead reckoning, EKF2 reset its position to it. Otherwise,
         # the reset is to the newest possible sample
         if len(rows_after_dead_reckoning):
             is_reset[rows_after_dead_reckoning[0]] = True
         elif len(reset_rows):
             is_reset[reset_rows[-1]] = True
-    # The sample at each logged time of the last fusion (last_fused_s) was fused, so it was not
-    # rejected
-    fused_rows = last_fusion_rows[last_fusion_rows > 0] - 1
+    # 4. The samples of the last fusions, just before the first span, are not rejected
+    rows_after_fusion = fusion_to_log_rows[:, 0]
+    fused_rows = rows_after_fusion[rows_after_fusion > 0] - 1
     is_undecided = ~is_reset[fused_rows] & np.isnan(rejected_flags[fused_rows])
     rejected_flags[fused_rows[is_undecided]] = 0.0
     return rejected_flags, is_reset
 
 
-def _find_dead_reckoning_spans(ekf2: Ekf2, fusion_record: FusionRecord) -> Array:
+def _find_dead_reckoning_spans(ekf2: Ekf2, fusion_record: FusionRecord, aid: Aid) -> Array:
     """Return start and end (s) of each time in which EKF2 used only the IMU (dead reckoning).
 
-    The start is the last fusion of vision, the end is the next fusion or reset.
+    The start is the last fusion of vision, the end is the next fusion or reset. The result is empty
+    if GNSS is the position source.
     """
     dead_reckoning_flag = fusion_record.status_flags.get(DEAD_RECKONING_FLAG)
     vision_enabled_flag = ekf2.status_flags.get(EV_POS.name)
-    if dead_reckoning_flag is None or vision_enabled_flag is None:
+    if aid != EV_POS or dead_reckoning_flag is None or vision_enabled_flag is None:
         return np.zeros((0, 2))
     spans_s = np.array(find_spans(dead_reckoning_flag != 0.0, np.inf)).reshape(-1, 2)
+    # EKF2 sets the flag some time after the last fusion, or at once if vision is disabled
     spans_s[:, 0] -= DEAD_RECKONING_TIMEOUT_S * (
         sample_step_function(vision_enabled_flag, spans_s[:, 0]) > 0.0
     )
@@ -686,13 +690,9 @@ def _find_vision_track(flight: Flight) -> PositionTrack | Unavailable:
     for track in sorted(flight.positions, key=lambda track: track.origin == POSITION_FILE_ORIGIN):
         if track.origin.is_vision and track.origin.has_all_samples:
             return track
-        if track.name in LOGGING_INTERVAL_BY_VISION_TOPIC_S:
-            # A median clearly below the default logging interval means a higher logging rate
+        if track.name in MAX_INTERVAL_BY_VISION_TOPIC_S:
             median_interval_s = compute_median_interval_s(track.samples.index)
-            if (
-                median_interval_s < 0.9 * LOGGING_INTERVAL_BY_VISION_TOPIC_S[track.name]
-                and median_interval_s <= 0.25
-            ):
+            if median_interval_s <= MAX_INTERVAL_BY_VISION_TOPIC_S[track.name]:
                 return track
             missing_reasons.append(
                 f"{track.name} is logged every {median_interval_s:.2g} s; EKF2 may have fused more "

@@ -19,13 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.core.arrays import Array, BoolArray, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.trajectory.rotation import rotate, skew
 
 from .inputs import ReplayInputs
 from .replay_segments import (
-    BIASES,
+    ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
+    GYRO_BIAS,
     MOTION_STATE_COUNT,
     POSITION,
     STATE_COUNT,
@@ -46,7 +47,8 @@ NO_ACTION, FUSE, START_FUSION = 0, 1, 2
 # accelerometer bias (6 to 8). The last two columns are state changes by EKF2's attitude correction
 # (9) and by the measured acceleration (10)
 DERIVATIVE_COLUMN_COUNT = 11
-COLUMN_OF_DERIVATIVE_BY_ATTITUDE_CORRECTION, COLUMN_OF_DERIVATIVE_BY_ACCELERATION = 9, 10
+BY_ATTITUDE, BY_GYRO_BIAS, BY_ACCELEROMETER_BIAS = slice(0, 3), slice(3, 6), slice(6, 9)
+BY_ATTITUDE_CORRECTION, BY_ACCELERATION = 9, 10
 
 # One row per event: fusion of a position or, in a gap, of height and heading only
 FusionEvents = np.recarray[Any, Any]
@@ -102,13 +104,15 @@ class EventIntervals:
         """
         state_derivatives, duration_s = self.state_derivatives[rows], self.duration_s[rows]
         transition = np.tile(np.eye(MOTION_STATE_COUNT, STATE_COUNT), (len(duration_s), 1, 1))
-        transition[:, :, THETA] = state_derivatives[..., :3]
-        transition[:, :, BIASES] = state_derivatives[..., 3:9]
+        transition[:, :, THETA] = state_derivatives[..., BY_ATTITUDE]
+        transition[:, :, GYRO_BIAS] = state_derivatives[..., BY_GYRO_BIAS]
+        transition[:, :, ACCELEROMETER_BIAS] = state_derivatives[..., BY_ACCELEROMETER_BIAS]
+        # Position changes by velocity · duration
         transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
         return (
             transition,
-            state_derivatives[..., COLUMN_OF_DERIVATIVE_BY_ATTITUDE_CORRECTION],
-            state_derivatives[..., COLUMN_OF_DERIVATIVE_BY_ACCELERATION],
+            state_derivatives[..., BY_ATTITUDE_CORRECTION],
+            state_derivatives[..., BY_ACCELERATION],
             *_compute_imu_process_noise(
                 self.prediction_step_counts[rows], duration_s, transition[:, VELOCITY, THETA]
             ),
@@ -139,13 +143,13 @@ def make_event_intervals(
     The number of intervals does not depend on ``delays``.
     """
     events = _make_fusion_events(inputs, segment, delays)
-    end_steps = events.end_step
-    start_steps = np.append(0, end_steps[:-1])
+    start_steps = np.append(0, events.end_step[:-1])
+    step_counts = events.end_step - start_steps
     return EventIntervals(
         events,
-        (end_steps - start_steps).astype(float),
-        segment.time_s[end_steps] - segment.time_s[start_steps],
-        _integrate_state_derivatives(segment, start_steps, end_steps),
+        step_counts.astype(float),
+        segment.time_s[events.end_step] - segment.time_s[start_steps],
+        _integrate_state_derivatives(segment, start_steps, step_counts),
     )
 
 
@@ -154,17 +158,22 @@ def _make_fusion_events(
 ) -> FusionEvents:
     received_positions = inputs.received_positions
     time_s = segment.time_s
+    # 1. Prediction step in which EKF2 fuses each sample
     first_row, end_row = np.searchsorted(received_positions.timestamp_s, time_s[[0, -1]])
     timestamp_s = received_positions.timestamp_s[first_row:end_row]
     last_step = len(time_s) - 1
+    # EKF2 also subtracts half a prediction step (estimator_interface.cpp)
     measurement_times_s = timestamp_s - delays.delay_s - 0.5 * inputs.mean_step_s
     # EKF2 fuses a late sample when it arrives
     earliest_fusion_times_s = np.maximum(
         measurement_times_s, received_positions.arrival_s[first_row:end_row] - delays.horizon_s
     )
+    # 1e-9 s: rounding errors
     fusion_step_by_sample = np.searchsorted(time_s, earliest_fusion_times_s - 1e-9)
     is_inside = (fusion_step_by_sample > 0) & (fusion_step_by_sample <= last_step)
+    # A sample is not fused before the earlier samples
     fusion_step_by_sample = np.maximum.accumulate(np.minimum(fusion_step_by_sample, last_step))
+    # 2. Action of EKF2 on each sample
     is_in_time = time_s[fusion_step_by_sample] < measurement_times_s + MAX_DELAY_BEHIND_HORIZON_S
     is_usable = is_inside & is_in_time
     # EKF2 fuses only the newer of two samples in one prediction step
@@ -172,17 +181,20 @@ def _make_fusion_events(
     action, can_start_fusion = _find_fusion_actions(
         inputs, segment, measurement_times_s, fusion_step_by_sample, is_usable
     )
+    # The sender requested a reset
     action[np.isin(timestamp_s, received_positions.reset_times_s) & (action == FUSE)] = START_FUSION
-    # In a gap of the position source, height and heading are fused at regular intervals
+    # 3. Further events: in a gap before the first, between two, or after the last sample, height
+    # and heading are fused at regular intervals
     gap_s = np.diff(np.r_[time_s[0], timestamp_s, time_s[-1]])
     event_counts_in_gaps = np.maximum(
         np.ceil(gap_s / inputs.max_height_fusion_interval_in_position_gap_s).astype(int) - 1, 0
     )
+    # Each sample has one event, after the events of the gap before it
     event_row_by_sample = np.cumsum(event_counts_in_gaps[:-1] + 1) - 1
     event_count = len(timestamp_s) + int(event_counts_in_gaps.sum())
     events = np.zeros(event_count, EVENT_DTYPE).view(np.recarray)
-    # In a gap of the position source, events without a position divide the gap into equal numbers
-    # of prediction steps
+    # The events in a gap divide it into equal numbers of prediction steps: interpolate the step
+    # between the events of the samples. The start is row -1, the end is row event_count
     events.end_step = np.rint(
         np.interp(
             np.arange(event_count),
@@ -190,6 +202,7 @@ def _make_fusion_events(
             np.r_[0, fusion_step_by_sample, last_step],
         )
     )
+    # 4. Fields of all events, then those of the events with a sample
     events.sample, events.time_s = -1, time_s[events.end_step]
     delay_of_fusion_s = earliest_fusion_times_s - measurement_times_s
     for name, values in (
@@ -225,13 +238,12 @@ def _find_fusion_actions(
     can_start_fusion[usable_rows] = (
         np.diff(usable_times_s, prepend=-np.inf) < fusion_rules.max_sample_interval_to_start_s
     )
-    # EKF2 stops position fusion after stop_timeout_s without a sample. It checks this time in each
-    # prediction step. The last check without the new sample is in the step before its fusion
-    sample_gaps_s = segment.time_s[end_steps[usable_rows] - 1] - np.append(
-        np.inf, usable_times_s[:-1]
-    )
+    # EKF2 stops fusion if the time since the previous sample exceeds a timeout. EKF2 checks this in
+    # each prediction step: the last check without the new sample is in the step before its fusion.
+    # There is no gap before the first sample
+    sample_gaps_s = segment.time_s[end_steps[usable_rows[1:]] - 1] - usable_times_s[:-1]
     is_fusing = segment.starts_while_fusing
-    for row, gap_s in zip(usable_rows.tolist(), sample_gaps_s.tolist(), strict=True):
+    for row, gap_s in zip(usable_rows.tolist(), [0.0, *sample_gaps_s.tolist()], strict=False):
         is_fusing = is_fusing and gap_s <= fusion_rules.stop_timeout_s
         if is_fusing:
             action[row] = FUSE
@@ -242,23 +254,21 @@ def _find_fusion_actions(
 
 
 def _integrate_state_derivatives(
-    segment: ReplaySegment, start_steps: IntArray, end_steps: IntArray
+    segment: ReplaySegment, start_steps: IntArray, prediction_step_counts: IntArray
 ) -> Array:
     """Return the derivatives of the motion state at the end of each interval.
 
-    Rows: attitude error, velocity and position. Columns: derivatives with respect to initial
-    attitude error (3), gyro bias (3) and accelerometer bias (3); then the changes of the state by
-    EKF2's attitude correction (1) and by the measured acceleration (1).
+    Rows: attitude error, velocity and position. Columns: see DERIVATIVE_COLUMN_COUNT. The
+    derivatives follow the prediction step at the top of this module.
     """
-    prediction_step_counts = end_steps - start_steps
     # All intervals are integrated together, step by step. Sorted by length, longest first, the
     # intervals that have not ended are always the first rows
     longest_first_indices = np.argsort(-prediction_step_counts, kind="stable")
     start_steps_longest_first = start_steps[longest_first_indices]
     attitude_derivatives, velocity_derivatives, position_derivatives = state_derivatives = np.zeros(
-        (3, len(end_steps), 3, DERIVATIVE_COLUMN_COUNT)
+        (3, len(start_steps), 3, DERIVATIVE_COLUMN_COUNT)
     )
-    attitude_derivatives[:, :, 0:3] = np.eye(3)
+    attitude_derivatives[:, :, BY_ATTITUDE] = np.eye(3)
     specific_force_ned_m_s2 = rotate(segment.body_to_ned[1:], segment.specific_force_m_s2)
     step_numbers = np.arange(int(prediction_step_counts.max(initial=0)))
     # Number of intervals with more than 0, 1, 2, ... steps
@@ -268,20 +278,21 @@ def _integrate_state_derivatives(
         step = start_steps_longest_first[rows] + step_number
         dt = segment.step_s[step][:, None, None]
         force_m_s2 = specific_force_ned_m_s2[step]
-        # Change of attitude per gyro bias, and of velocity per accelerometer bias, in one step
-        state_derivative_by_bias_in_step = -segment.body_to_ned[1:][step] * dt
-        # Position changes by the mean of the velocities before and after the step
+        # -R Δt: change of attitude per gyro bias, and of velocity per accelerometer bias
+        change_by_bias = -segment.body_to_ned[1:][step] * dt
+        # p: first half, with the velocity before the step
         position_derivatives[rows] += 0.5 * dt * velocity_derivatives[rows]
+        # v: all columns by -[a]× Δt δθ; then the effects of bias and acceleration in this step
         velocity_derivatives[rows] += (-skew(force_m_s2) * dt) @ attitude_derivatives[rows]
-        velocity_derivatives[rows, :, 6:9] += state_derivative_by_bias_in_step
-        velocity_derivatives[rows, :, COLUMN_OF_DERIVATIVE_BY_ACCELERATION] += (
-            force_m_s2 + GRAVITY_M_S2
-        ) * dt[:, :, 0]
+        velocity_derivatives[rows, :, BY_ACCELEROMETER_BIAS] += change_by_bias
+        velocity_derivatives[rows, :, BY_ACCELERATION] += (force_m_s2 + GRAVITY_M_S2) * dt[:, :, 0]
+        # p: second half, with the velocity after the step
         position_derivatives[rows] += 0.5 * dt * velocity_derivatives[rows]
-        attitude_derivatives[rows, :, 3:6] += state_derivative_by_bias_in_step
-        attitude_derivatives[rows, :, COLUMN_OF_DERIVATIVE_BY_ATTITUDE_CORRECTION] -= (
-            segment.attitude_correction_rad[step]
-        )
+        # δθ: last, because the velocity changes with the attitude before the step
+        attitude_derivatives[rows, :, BY_GYRO_BIAS] += change_by_bias
+        attitude_derivatives[rows, :, BY_ATTITUDE_CORRECTION] -= segment.attitude_correction_rad[
+            step
+        ]
     # Restore the order of the intervals
     state_derivatives[:, longest_first_indices] = state_derivatives.copy()
     return np.concatenate(state_derivatives, axis=1)
@@ -289,15 +300,15 @@ def _integrate_state_derivatives(
 
 def _compute_imu_process_noise(
     prediction_step_counts: Array, duration_s: Array, velocity_derivative_by_attitude: Array
-) -> tuple[Array, Array]:
+) -> ArrayPair:
     """Return the process noise for unit gyro noise, and for unit accelerometer noise.
 
     The specific force is assumed to be constant in an interval of n steps of length d. In one step,
     an attitude error changes the velocity by m per rad. Noise that acts k steps before the end of
     the interval changes the attitude by d, the velocity by k m d (gyro) or d (accelerometer), and
     the position by k (k - 1) m d² / 2 or k d². The blocks are sums of products of these changes
-    over all k. For the effect of gyro noise on the position, some sums are replaced by their
-    leading terms.
+    over k = 0 to n - 1. Two sums of gyro noise are replaced by their leading terms, which dominate
+    for large n: Σ k² (k - 1) / 2 by n⁴ / 8, and Σ k² (k - 1)² / 4 by n⁵ / 20.
     """
     n = np.maximum(prediction_step_counts, 1.0)[:, None, None]
     d = duration_s[:, None, None] / n
@@ -313,6 +324,7 @@ def _compute_imu_process_noise(
     for matrix, rows, columns, block in (
         (gyro_noise_covariance, THETA, THETA, n * d**2 * eye),
         (gyro_noise_covariance, VELOCITY, THETA, m * d**2 * sum_k),
+        # Σ k (k - 1) / 2 = n (n - 1) (n - 2) / 6
         (gyro_noise_covariance, POSITION, THETA, m * d**3 * n * (n - 1) * (n - 2) / 6),
         (gyro_noise_covariance, VELOCITY, VELOCITY, mm * d**2 * sum_k_squared),
         (gyro_noise_covariance, POSITION, VELOCITY, mm * d**3 * n**4 / 8),

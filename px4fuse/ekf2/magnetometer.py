@@ -46,24 +46,24 @@ def average_by_event(
     """Return the mean of the magnetometer or optical flow samples before each fusion."""
     # Index of the event (fusion) at or after each sample
     event_index = np.searchsorted(event_end_steps, sensor_samples.step_indices)
-    # Samples after the last event are in an additional last row, which is not returned
+    # Samples after the last event are collected in one more row, which is omitted at the end
     row_count = len(event_end_steps) + 1
-    sample_count_by_event = np.maximum(np.bincount(event_index, minlength=row_count), 1)
+    mean_count_by_event = np.maximum(np.bincount(event_index, minlength=row_count), 1)
 
     def mean(values: Array) -> Array:
         sum_by_event = np.zeros((row_count, *values.shape[1:]))
         np.add.at(sum_by_event, event_index, values)
-        return (sum_by_event.T / sample_count_by_event).T[:-1]
+        return (sum_by_event.T / mean_count_by_event).T[:-1]
 
     value, ned_to_body_rotation, noise_variance = map(
         mean, (sensor_samples.value, sensor_samples.ned_to_body_rotation, sensor_samples.noise)
     )
     if VELOCITY in sensor_samples.state_slices:
-        # The velocity change from the IMU since the start of the segment was subtracted from the
-        # optical flow samples. Add the velocity change up to the event
+        # The IMU velocity change up to the time of each sample was subtracted from optical flow.
+        # Add the change up to the event: the mean is then a velocity at the event
         velocity_m_s = segment.imu_velocity_change_m_s[event_end_steps]
         value = value + np.einsum("eab,eb->ea", ned_to_body_rotation, velocity_m_s)
-    # A sample can itself be the mean of several EKF2 samples: add their numbers
+    # Each of ``sensor_samples`` may itself be the mean of several EKF2 samples: add their numbers
     sample_count = np.bincount(event_index, sensor_samples.sample_count, row_count)[:-1]
     return EventSamples(
         value, ned_to_body_rotation, np.asarray(sample_count, float), noise_variance
@@ -97,6 +97,8 @@ def fuse_mean_sample(
     """
     estimated_vector_ned = x[:, measured_states]
     sample_count, R = mean_sample.sample_count, mean_sample.noise
+    # 1. Innovation. Measurement: h(x) = C (I - [δθ]×) v + b, with the rotation C from NED to the
+    # nominal body axes, attitude error δθ, vector v (NED) and sensor bias b. C [v]× = dh/dδθ
     H = np.zeros((len(x), mean_sample.value.shape[-1], x.shape[1]))
     H[:, :, THETA] = mean_sample.ned_to_body_rotation @ skew(estimated_vector_ned)
     H[:, :, measured_states] = mean_sample.ned_to_body_rotation @ (np.eye(3) - skew(x[:, THETA]))
@@ -105,18 +107,17 @@ def fuse_mean_sample(
         H[:, :, bias_states] = np.eye(3)
         predicted_value += x[:, bias_states]
     nu = mean_sample.value - predicted_value
+    # 2. Gate, with the noise of one sample
     HP = H @ P
-    S = HP @ H.transpose(0, 2, 1)
-    # innovation_variances is a view of the diagonal of S: adding R to it below changes S
-    innovation_variances = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]
+    HPH = HP @ H.transpose(0, 2, 1)
+    innovation_variance = np.diagonal(HPH, axis1=1, axis2=2) + R[:, None]
     has_sample = sample_count > 0.0
-    update = np.empty((3, *nu.shape))
-    update[0], update[1] = nu, innovation_variances + R[:, None]
-    is_fused = has_sample & (nu * nu <= gate[:, None] ** 2 * update[1]).all(axis=1)
-    update[2] = is_fused[:, None]
+    is_fused = has_sample & (nu * nu <= gate[:, None] ** 2 * innovation_variance).all(axis=1)
+    update = np.array([nu, innovation_variance, np.tile(is_fused, (nu.shape[1], 1)).T])
     update[:, ~has_sample] = np.nan
-    # Noise of the mean of n samples: R / n. Without a sample, 1 avoids a singular S
-    innovation_variances += np.where(has_sample, R / np.maximum(sample_count, 1.0), 1.0)[:, None]
+    # 3. Update, with the noise R / n of the mean. Without a sample, 1 avoids a singular S
+    mean_noise = np.where(has_sample, R / np.maximum(sample_count, 1.0), 1.0)
+    S = HPH + mean_noise[:, None, None] * np.eye(nu.shape[1])
     K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * is_fused[:, None, None]
     x = x + (K @ nu[:, :, None])[:, :, 0]
     P = P - K @ HP

@@ -40,14 +40,19 @@ from px4fuse.trajectory.rotation import rotate
 from .filter_batch import FilterConfiguration
 from .filter_recursion import (
     HEADING,
-    HORIZONTAL_POSITION,
     HORIZONTAL_POSITION_COLUMNS,
     SegmentRun,
     estimate_state_correlation,
     run_segment,
 )
 from .heights import MIN_INNOVATION_GATE
-from .inputs import ANALYSIS_NAME, ReplayInputs, find_matching_samples, prepare_inputs
+from .inputs import (
+    ANALYSIS_NAME,
+    ReceivedPositions,
+    ReplayInputs,
+    find_matching_samples,
+    prepare_inputs,
+)
 from .intervals import make_event_intervals
 from .output_predictor import compute_published_state, sum_attitude_corrections
 from .replay import (
@@ -62,6 +67,7 @@ from .replay_segments import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
     GYRO_BIAS,
+    HORIZONTAL_POSITION,
     POSITION,
     RESTART_GAP_S,
     THETA,
@@ -115,21 +121,25 @@ def prepare_ekf2_model(
         Function that returns the filter configurations that later analyses need. They are computed
         together with the logged configuration, which is faster.
     """
-    # For each omitted aiding source (PX4's name): agreement with the log of the replay that still
-    # fused it
-    failed_agreement_by_aid: dict[str, ReplayAgreement] = {}
+    # Reasons for omission, and fields of ReplayAgreement from the replay that still fused an
+    # omitted source, by PX4's name of the source
+    omitted_aids: dict[str, str] = {}
+    fields_of_omitted_aids: dict[str, Any] = {}
     while True:
-        omitted_aids = {
-            name: agreement.doubtful[name] for name, agreement in failed_agreement_by_aid.items()
-        }
         model = _replay_logged_parameters(flight, list_later_configurations, omitted_aids)
         if isinstance(model, Unavailable):
             return model
         agreement = model.agreement
-        further_omitted_aids = agreement.doubtful.keys() - omitted_aids.keys()
-        if not further_omitted_aids:
+        failed_aids = [name for name in agreement.doubtful if name not in omitted_aids]
+        if not failed_aids:
             break
-        failed_agreement_by_aid |= dict.fromkeys(further_omitted_aids, agreement)
+        for name in failed_aids:
+            omitted_aids[name] = agreement.doubtful[name]
+            # The agreement of optical flow is one number, that of other sources is by axis
+            field_name = "carried_difference_m" if name == FLOW.name else name
+            fields_of_omitted_aids[field_name] = getattr(agreement, field_name)
+    # With many rejections, replay and EKF2 may reject different samples: compare a replay with the
+    # logged rejections instead
     if (
         max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
         > MAX_REJECTED_FRACTION_FOR_COMPARISON
@@ -142,11 +152,9 @@ def prepare_ekf2_model(
             agreement = judge_agreement_with_logged_rejections(
                 agreement, agreement_with_logged_rejections
             )
-    fields: dict[str, Any] = {"doubtful": {**omitted_aids, **agreement.doubtful}}
-    for name, failed_agreement in failed_agreement_by_aid.items():
-        field_name = "carried_difference_m" if name == FLOW.name else name
-        fields[field_name] = getattr(failed_agreement, field_name)
-    agreement = structs.replace(agreement, **fields)
+    agreement = structs.replace(
+        agreement, doubtful={**omitted_aids, **agreement.doubtful}, **fields_of_omitted_aids
+    )
     return replace(
         model,
         baseline_replay=structs.replace(model.baseline_replay, agreement=agreement),
@@ -223,13 +231,15 @@ def replay_with_settings(
     ]
     runs: Sequence[SegmentRun] = ()
     for index, (configuration, change) in enumerate(zip(configurations, changes, strict=True)):
+        # The configurations of a batch are computed at once, before the first of them is used
         if index % REPLAY_BATCH_SIZE == 0:
             runs = ()  # free the memory before the next batch
             runs = _run_model(model, configurations[index : index + REPLAY_BATCH_SIZE])
         replay = _make_replay(inputs, runs, configuration, change)
         updates = replay.updates
         if excluded_times_s is not None:
-            age_s = configuration.settings[inputs.aid.delay] * 1e-3 + 0.5 * inputs.mean_step_s
+            # Updates are indexed by measurement time, see FilterConfiguration.compute_delays
+            age_s = configuration.compute_delays(inputs).delay_s + 0.5 * inputs.mean_step_s
             updates = updates[
                 ~_find_excluded_rows(updates.index.to_numpy(), excluded_times_s - age_s)
             ]
@@ -307,12 +317,15 @@ def _describe_modelled_aids(inputs: ReplayInputs) -> str:
 def add_position_noise(model: Ekf2Model, sigma_m: float, seed: int) -> Ekf2Model:
     """Add normal noise with standard deviation ``sigma_m`` (m) to each position in the inputs."""
     rng = np.random.default_rng(seed)
-    noisy_inputs: dict[str, Any] = {}
-    for name in ("received_positions", "vision_positions"):
-        if samples := getattr(model.inputs, name):
-            position_noise_m = rng.normal(scale=sigma_m, size=samples.position_m.shape)
-            noisy_inputs[name] = replace(samples, position_m=samples.position_m + position_noise_m)
-    return _replace_inputs(model, **noisy_inputs)
+
+    def add_noise(samples: ReceivedPositions) -> ReceivedPositions:
+        position_noise_m = rng.normal(scale=sigma_m, size=samples.position_m.shape)
+        return replace(samples, position_m=samples.position_m + position_noise_m)
+
+    received, vision = model.inputs.received_positions, model.inputs.vision_positions
+    return _replace_inputs(
+        model, received_positions=add_noise(received), vision_positions=vision and add_noise(vision)
+    )
 
 
 def misalign_positions(model: Ekf2Model, rotation_deg: float, delay_s: float) -> Ekf2Model:
@@ -339,12 +352,14 @@ def compute_delayed_tracks(
     The table covers the whole flight, and contains EKF2's delayed state at the fusion horizon.
     """
     runs = _run_model(model, configurations)
-    for index in map(runs[0].configurations.index, configurations):
-        yield pd.concat([_make_delayed_track(run, index) for run in runs])
+    for configuration in configurations:
+        index = runs[0].configurations.index(configuration)
+        yield pd.concat(
+            [_make_delayed_track(run, compute_delayed_states(run, index)) for run in runs]
+        )
 
 
-def _make_delayed_track(run: SegmentRun, configuration_index: int) -> pd.DataFrame:
-    state = compute_delayed_states(run, configuration_index)
+def _make_delayed_track(run: SegmentRun, state: Array) -> pd.DataFrame:
     return _make_track(run, state[:, VELOCITY], state[:, POSITION])
 
 
@@ -365,18 +380,16 @@ def run_configurations(
     delays_by_configuration = [
         configuration.compute_delays(inputs) for configuration in configurations
     ]
-    intervals_by_delays = {
-        delays: [make_event_intervals(inputs, segment, delays) for segment in inputs.segments]
-        for delays in set(delays_by_configuration)
-    }
-    return [
-        run_segment(inputs, segment, configurations, intervals)
-        for segment, *intervals in zip(
-            inputs.segments,
-            *(intervals_by_delays[delays] for delays in delays_by_configuration),
-            strict=True,
-        )
-    ]
+    runs = []
+    for segment in inputs.segments:
+        # Configurations with the same delays share their intervals
+        intervals_by_delays = {
+            delays: make_event_intervals(inputs, segment, delays)
+            for delays in set(delays_by_configuration)
+        }
+        intervals = [intervals_by_delays[delays] for delays in delays_by_configuration]
+        runs.append(run_segment(inputs, segment, configurations, intervals))
+    return runs
 
 
 def _make_track(run: SegmentRun, velocity_m_s: Array, position_m: Array) -> pd.DataFrame:
@@ -435,38 +448,29 @@ def _collect_updates_by_aid(
     inputs: ReplayInputs, run: SegmentRun, configuration_index: int
 ) -> dict[str, pd.DataFrame]:
     """Return the updates of one filter configuration, by PX4's name of the aiding source."""
-    # Columns of R, nu and S: velocity and position, see SegmentRun
     events, height_filter = run.events[configuration_index], run.height_filter
     end_s = run.segment.time_s[events.end_step]
-    nu, S, R, rejected, fused, reset, posterior_variance = (
-        array[:, configuration_index]
-        for array in (
-            run.innovation,
-            run.innovation_variance,
-            run.noise,
-            run.rejected,
-            run.fused,
-            run.reset,
-            run.variance[1:],
-        )
-    )
+    # Rows: events. Columns: velocity and position (NED)
+    nu, S = run.innovation[:, configuration_index], run.innovation_variance[:, configuration_index]
 
     def make_axis_table(
         axes: Sequence[NedAxis], columns: slice, *other_values: Any
     ) -> pd.DataFrame:
+        """Return a table with ν, S and further columns in the order of make_update_table."""
         update_records = np.column_stack([nu[:, columns], S[:, columns], *other_values])
+        # One sample per event
         return make_update_table(update_records[:, None], events.time_s[:, None], end_s, axes)
 
-    position_variance = posterior_variance[:, HORIZONTAL_POSITION]
     updates_by_aid = {
         inputs.aid.name: make_axis_table(
             HORIZONTAL_AXES,
             HORIZONTAL_POSITION_COLUMNS,
-            rejected,
-            fused,
-            reset,
-            position_variance,
-            R[:, HORIZONTAL_POSITION_COLUMNS],
+            run.rejected[:, configuration_index],
+            run.fused[:, configuration_index],
+            run.reset[:, configuration_index],
+            # Position variance after each event. Row 0 is the start
+            run.variance[1:, configuration_index, HORIZONTAL_POSITION],
+            run.noise[:, configuration_index, HORIZONTAL_POSITION_COLUMNS],
         )
     }
     if height_filter is not None:
@@ -474,7 +478,8 @@ def _collect_updates_by_aid(
             updates_by_aid[name] = height_filter.make_update_table(name, configuration_index, end_s)
     if inputs.received_positions.velocity_m_s is not None:
         gate = run.configurations[configuration_index].settings[GNSS_VEL.gate]
-        # The factor 1 + 1e-9 allows for rounding errors of innovations that are clipped to the gate
+        # The run contains no decision on the velocity: test it again. The factor 1 + 1e-9 allows
+        # for rounding errors of innovations that are clipped to the gate
         squared_gate = (1.0 + 1e-9) * max(gate, MIN_INNOVATION_GATE) ** 2
         is_outside_gate = (nu[:, :3] ** 2 > squared_gate * S[:, :3]).any(axis=1)
         # Without GNSS heights, the table contains only the horizontal axes
@@ -522,8 +527,7 @@ def _make_state_tracks(
     heading_rad = (
         np.arctan2(segment.body_to_ned[:, 1, 0], segment.body_to_ned[:, 0, 0]) + state[:, HEADING]
     )
-    fusion_horizon_track = _make_track(run, state[:, VELOCITY], state[:, POSITION])
-    return fusion_horizon_track.assign(heading_rad=heading_rad), _make_track(
+    return _make_delayed_track(run, state).assign(heading_rad=heading_rad), _make_track(
         run, published_velocity_m_s, published_position_m
     )
 
@@ -533,18 +537,22 @@ def compute_delayed_states(run: SegmentRun, configuration_index: int) -> Array:
 
     The state has the shape (n + 1, 15) or more.
     """
+    # States at the start and after each event
     event_states = run.state[:, configuration_index]
     event_steps = run.events[configuration_index].end_step
     step_count = len(run.segment.step_s)
-    # First prediction step of the interval after each event, and end of the last interval
+    # First prediction step of the interval after the start and after each event, and end of the
+    # last interval
     first_steps = np.concatenate([[0], event_steps, [step_count]])
     states = np.empty((step_count + 1, event_states.shape[1]))
     states[0] = event_states[0]
     for first_event in range(0, len(event_states), EVENTS_PER_BLOCK):
         block_first_steps = first_steps[first_event : first_event + EVENTS_PER_BLOCK + 1]
-        states[1:][block_first_steps[0] : block_first_steps[-1]] = _propagate_states(
+        # Row 0 is the start, so the state after step i (from 0) is row i + 1
+        states[block_first_steps[0] + 1 : block_first_steps[-1] + 1] = _propagate_states(
             run, configuration_index, event_states[first_event:], block_first_steps
         )
+    # The last step of an interval ends with an event: the state after the fusion
     states[event_steps] = event_states[1:]
     return states
 
@@ -569,19 +577,21 @@ def _propagate_states(
     segment, configuration = run.segment, run.configurations[configuration_index]
     interval_lengths = np.diff(first_steps)
     event_states = event_states[: len(interval_lengths)]
+    # The biases have their final value, the motion states are computed below
     state = np.repeat(event_states, interval_lengths, axis=0)
     steps = slice(first_steps[0], first_steps[-1])
+    # Attitude at the end of each step; row 0 is the start of the segment
     body_to_ned, step_s = segment.body_to_ned[1:][steps], segment.step_s[steps, None]
 
     def integrate(rows: slice, increments: Array) -> ArrayPair:
         """Return the state elements ``rows`` before and after each prediction step.
 
         In each interval, they are the state after the fusion plus the sum of the increments since
-        then.
+        then. That sum is the sum from the first step on, minus its value at the fusion.
         """
         sums = cumulative_sums(increments)
-        sums_at_events = sums[first_steps[:-1] - first_steps[0]]
-        offsets = np.repeat(event_states[:, rows] - sums_at_events, interval_lengths, axis=0)
+        sums_at_fusions = sums[first_steps[:-1] - first_steps[0]]
+        offsets = np.repeat(event_states[:, rows] - sums_at_fusions, interval_lengths, axis=0)
         return sums[:-1] + offsets, sums[1:] + offsets
 
     # Prediction of attitude error, velocity and position, see intervals.py
@@ -594,8 +604,8 @@ def _propagate_states(
         np.cross(attitude_error_before_rad, specific_force_ned_m_s2)
         + specific_force_ned_m_s2
         + GRAVITY_M_S2
+        - rotate(body_to_ned, state[:, ACCELEROMETER_BIAS])
     )
-    acceleration -= rotate(body_to_ned, state[:, ACCELEROMETER_BIAS])
     velocity_before_m_s, state[:, VELOCITY] = integrate(VELOCITY, acceleration * step_s)
     mean_velocity_m_s = 0.5 * (velocity_before_m_s + state[:, VELOCITY])
     state[:, POSITION] = integrate(POSITION, mean_velocity_m_s * step_s)[1]

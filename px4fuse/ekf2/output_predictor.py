@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.linalg import lapack
 
-from px4fuse.core.arrays import Array
+from px4fuse.core.arrays import Array, ArrayPair
 from px4fuse.trajectory.rotation import rotate
 
 from .replay_segments import (
@@ -25,6 +25,8 @@ from .replay_segments import (
 
 # Gain of the integral correction of velocity and position (output_predictor.cpp)
 OUTPUT_INTEGRAL_GAIN = 0.1
+# Maximum time constant (s) of the corrections of velocity and position (output_predictor.cpp)
+MAX_OUTPUT_TIME_CONSTANT_S = 10.0
 # Gain of the attitude correction (output_predictor.cpp)
 ATTITUDE_CORRECTION_GAIN = 0.5
 
@@ -36,7 +38,7 @@ def compute_published_state(
     published_minus_nominal_attitude_rad: Array,
     lag_steps: int,
     settings: Mapping[str, float],
-) -> tuple[Array, Array]:
+) -> ArrayPair:
     """Return the published velocity (m/s) and position (m) after each of n prediction steps.
 
     Parameters
@@ -88,9 +90,17 @@ def compute_published_state(
 def _predict_output(
     state: Array, imu_increments: Array, lag_steps: int, step_s: float, tau_s: float
 ) -> Array:
-    """Return the output predictor's velocity or position: sum of IMU increments and corrections."""
+    """Return the output predictor's velocity or position: sum of IMU increments and corrections.
+
+    Each correction is added to the whole output buffer, so the error at the fusion horizon in step
+    k is e_k = u_k - c_(k-1). Here u is the state minus the integrated IMU increments at the fusion
+    horizon, and c is the sum of the corrections: c_k = c_(k-1) + g e_k + i Σ e with the gain g and
+    the integral gain i. Without the sum (difference of two steps), this is the recursive filter
+
+        c_k + (g + i - 2) c_(k-1) + (1 - g) c_(k-2) = (g + i) u_k - g u_(k-1)
+    """
     integrated_state = np.cumsum(np.concatenate([state[:1], imu_increments]), axis=0)
-    gain = step_s / np.clip(tau_s, step_s, 10.0)
+    gain = step_s / np.clip(tau_s, step_s, MAX_OUTPUT_TIME_CONSTANT_S)
     integral_gain = OUTPUT_INTEGRAL_GAIN * gain**2
     return integrated_state + _apply_recursive_filter(
         np.array([gain + integral_gain, -gain]),
@@ -110,8 +120,14 @@ def sum_attitude_corrections(
     """Return the sum of the output predictor's attitude corrections (rad) after each step.
 
     ``error_rad``, shape (n + 1, 3), is the attitude error at the fusion horizon.
+
+    Each step corrects the newest attitude by a fraction g of the error at the fusion horizon, of
+    which the corrections c up to that time are already removed. With L = ``lag_steps``:
+
+        c_k - c_(k-1) + g c_(k-L-1) = g error_(k-L-1)
     """
     gain = ATTITUDE_CORRECTION_GAIN * step_s / max(horizon_s, step_s)
+    # Element i is the coefficient of the value i steps ago
     numerator, denominator = np.zeros((2, lag_steps + 2))
     numerator[-1] = gain
     denominator[:2] = (1.0, -1.0)

@@ -228,8 +228,8 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> ReplayAgreement | Un
     """Compare an EKF2 replay with the logged innovations and states."""
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    state_difference = _subtract_logged_state(
-        replay, rows_inside(ekf2.state, replay.find_evaluated_spans())
+    state_difference = subtract_states(
+        replay.published_state, rows_inside(ekf2.state, replay.find_evaluated_spans())
     )
     if state_difference.empty:
         return Unavailable(
@@ -253,10 +253,11 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> ReplayAgreement | Un
         )
     agreement_by_axis, statistics = comparison
     agreement_by_aid, omitted_aids = _compare_other_aids(ekf2, replay, state_difference)
+    agreement_by_aid[aid.name] = agreement_by_axis
     # While EKF2 fuses only optical flow, position errors accumulate. Replay and log are therefore
     # compared by their largest position difference
-    flow_only_difference = _subtract_logged_state(
-        replay, rows_inside(ekf2.state, replay.optical_flow_only_spans_s)
+    flow_only_difference = subtract_states(
+        replay.published_state, rows_inside(ekf2.state, replay.optical_flow_only_spans_s)
     )
     flow_position_difference_m = None
     if len(flow_only_difference):
@@ -271,7 +272,9 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> ReplayAgreement | Un
                 f"(limit {MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
             )
     return ReplayAgreement(
-        **(agreement_by_aid | agreement_by_axis | {aid.name: agreement_by_axis} | statistics),
+        **agreement_by_axis,  # north and east
+        **agreement_by_aid,  # ev_pos, gnss_pos, gnss_vel, and so on
+        **statistics,  # samples to decisions_same, good and reason
         doubtful=omitted_aids,
         published_rms_difference_m=math.hypot(
             *(axis.position_rms_difference_m for axis in agreement_by_axis.values())
@@ -287,12 +290,13 @@ def _compare_innovations(
     logged_innovations: pd.DataFrame,
     has_measurement_times: bool,
     state_difference: pd.DataFrame,
-) -> tuple[dict[str, AxisAgreement], dict[str, Any]] | str:
+) -> tuple[dict[str, Any], dict[str, Any]] | str:
     """Compare replayed with logged innovations.
 
-    Return the agreement by axis, and fields of :class:`ReplayAgreement` for all axes together; or
-    the reason why the innovations cannot be compared.
+    Return :class:`AxisAgreement` by axis, and fields of :class:`ReplayAgreement` for all axes
+    together; or the reason why the innovations cannot be compared.
     """
+    # 1. Pairs of logged and replayed innovations in the evaluated time, row by row
     update_rows = match_updates(
         replayed_innovations,
         logged_innovations.index.to_numpy(),
@@ -307,45 +311,51 @@ def _compare_innovations(
     is_used &= logged_innovations[columns].any(axis=1)
     logged_innovations = logged_innovations[is_used]
     replayed_innovations = replayed_innovations.iloc[update_rows[is_used]]
+    # 2. Reasons against a comparison
     if len(logged_innovations) < MIN_COMPARED_INNOVATIONS:
         return (
             f"the log contains only {format_count(len(logged_innovations), 'innovation')} in the "
             f"replayed time (at least {MIN_COMPARED_INNOVATIONS} are needed)"
         )
-    compared_innovations = (logged_innovations, replayed_innovations)
-    if not all(np.ptp(innovations[columns], axis=0).all() for innovations in compared_innovations):
-        return CONSTANT_INNOVATIONS_REASON
-    is_rejected = np.array([innovations["rejected"] > 0.0 for innovations in compared_innovations])
-    agreement_by_axis: dict[str, AxisAgreement] = {
-        axis: _compare_axis(axis, *compared_innovations, state_difference) for axis in axes
+    # A constant innovation has no correlation
+    for innovations in (logged_innovations, replayed_innovations):
+        if not np.ptp(innovations[columns], axis=0).all():
+            return CONSTANT_INNOVATIONS_REASON
+    # 3. Comparison
+    agreement_by_axis: dict[str, Any] = {
+        axis: _compare_axis(axis, logged_innovations, replayed_innovations, state_difference)
+        for axis in axes
     }
-    logged_rejected_fraction, replayed_rejected_fraction = is_rejected.mean(axis=1).tolist()
-    is_in_agreement, reason = _judge_agreement(
-        agreement_by_axis, logged_rejected_fraction, replayed_rejected_fraction
-    )
+    is_rejected_logged = logged_innovations["rejected"].to_numpy() > 0.0
+    is_rejected_replayed = replayed_innovations["rejected"].to_numpy() > 0.0
+    rejected_fractions = float(is_rejected_logged.mean()), float(is_rejected_replayed.mean())
+    is_in_agreement, reason = _judge_agreement(agreement_by_axis, *rejected_fractions)
     return agreement_by_axis, {
         "samples": len(logged_innovations),
-        "rejected_fraction_logged": logged_rejected_fraction,
-        "rejected_fraction_replayed": replayed_rejected_fraction,
-        "decisions_same": float(np.mean(np.equal(*is_rejected))),
+        "rejected_fraction_logged": rejected_fractions[0],
+        "rejected_fraction_replayed": rejected_fractions[1],
+        "decisions_same": float(np.mean(is_rejected_logged == is_rejected_replayed)),
         "good": is_in_agreement,
         "reason": reason,
     }
 
 
-def _subtract_logged_state(replay: Ekf2Replay, logged_state: pd.DataFrame) -> pd.DataFrame:
-    """Return the replayed minus the logged state, at the times of the logged state."""
-    published_state = replay.published_state
+def subtract_states(state: pd.DataFrame, reference: pd.DataFrame) -> pd.DataFrame:
+    """Return a state minus a reference state, at the times of the reference."""
     return pd.DataFrame(
         {
-            name: np.interp(logged_state.index, published_state.index, published_state[name])
-            - logged_state[name]
+            name: np.interp(reference.index, state.index, state[name]) - reference[name]
             for name in Columns.STATE
         }
     )
 
 
 def _compute_heading_difference_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
+    """Return the RMS difference (°) of replayed and logged heading.
+
+    Return None if the replay does not estimate the heading: it then uses the logged heading.
+    """
+    # The settings contain magnetometer parameters only if the replay fuses the magnetometer
     if MAG.noise not in replay.settings or isinstance(ekf2.record, Unavailable):
         return None
     logged_state = rows_inside(ekf2.record.delayed_state, replay.find_evaluated_spans())
@@ -366,7 +376,7 @@ def _compare_other_aids(
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """Compare innovations of all aiding sources except the position source with the log.
 
-    Return the agreement of each source, and the reasons for disagreement.
+    Return the agreement of each source by axis, and the reasons to omit a source from the replay.
     """
     agreement_by_aid: dict[str, Any] = {}
     omitted_aids = {}
@@ -384,16 +394,16 @@ def _compare_other_aids(
             innovation_topic(AIDS[name]) in aid_log.topics,
             state_difference,
         )
-        # Replayed and logged GNSS velocity innovations may disagree. GNSS velocity is omitted from
-        # the replay only if its innovations are constant, as those of a frozen sensor
-        may_disagree = name == GNSS_VEL.name
+        reason = ""
         if isinstance(comparison, str):
-            if not may_disagree or comparison == CONSTANT_INNOVATIONS_REASON:
-                omitted_aids[name] = comparison
-            continue
-        agreement_by_aid[name], statistics = comparison
-        if not (statistics["good"] or may_disagree):
-            omitted_aids[name] = statistics["reason"]
+            reason = comparison
+        else:
+            agreement_by_aid[name], statistics = comparison
+            if not statistics["good"]:
+                reason = statistics["reason"]
+        # GNSS velocity is omitted only if its innovations are constant, as those of a frozen sensor
+        if reason and (name != GNSS_VEL.name or reason == CONSTANT_INNOVATIONS_REASON):
+            omitted_aids[name] = reason
     return agreement_by_aid, omitted_aids
 
 
@@ -418,12 +428,14 @@ def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
 def _join_axis_innovations(
     innovations: Mapping[NedAxis, pd.DataFrame | Unavailable],
 ) -> pd.DataFrame:
+    """Return one table with the innovations of all axes; empty if an axis is not logged."""
     columns = {}
     for axis, axis_innovations in innovations.items():
         if isinstance(axis_innovations, Unavailable):
             return pd.DataFrame()
         columns[f"innovation_{axis}_m"] = axis_innovations["innovation_m"]
         columns[f"innovation_variance_{axis}_m2"] = axis_innovations["innovation_variance_m2"]
+        # The flag is the same for all axes of a sample
         columns["rejected"] = axis_innovations["rejected"]
     return pd.DataFrame(columns).dropna()
 
@@ -451,17 +463,18 @@ def match_updates(
     """
     if has_measurement_times:
         return find_matching_samples(updates.index.to_numpy(), logged_times_s)
+    # The log contains EKF2's innovations at the logging times: those of the latest update. 0.1 ms
+    # allows for rounding errors of times
     fusion_times_s = updates["fused_at_s"].to_numpy()
     update_rows = np.searchsorted(fusion_times_s, logged_times_s + 1e-4, side="right") - 1
     age_s = logged_times_s - fusion_times_s[np.maximum(update_rows, 0)]
     is_matched = (update_rows >= 0) & (age_s <= MAX_INNOVATION_AGE_S)
-    # A log row in the same prediction step as a fusion may still contain the previous innovation
+    # A log row in the same prediction step as a fusion may still contain the previous innovation.
+    # Such rows are omitted, unless most rows are written in the prediction step of the fusion
     is_unambiguous = is_matched & (age_s >= SAME_STEP_TOLERANCE_S)
-    return np.where(
-        is_unambiguous if is_unambiguous.sum() > 0.5 * is_matched.sum() else is_matched,
-        update_rows,
-        -1,
-    )
+    if is_unambiguous.sum() > 0.5 * is_matched.sum():
+        is_matched = is_unambiguous
+    return np.where(is_matched, update_rows, -1)
 
 
 def _compare_axis(
@@ -522,7 +535,13 @@ def _judge_agreement(
     tolerance_factor: float = 1.0,
     min_allowed_correlation: float = MIN_INNOVATION_CORRELATION,
 ) -> tuple[bool, str]:
-    """Return True if the replay agrees with the log, and the statistics as a text."""
+    """Return True if the replay agrees with the log, and the statistics as a text.
+
+    1. The innovation variances must agree, because they hardly depend on single rejections.
+    2. If the innovations are correlated enough, the positions must agree.
+    3. If not, and few samples are rejected, the replay does not agree. With many rejections,
+       rejected fraction and mean NIS must agree: a different rejection changes later innovations.
+    """
     variance_ratios = (axis.s_ratio_median for axis in axes.values())
     worst_variance_ratio = max(variance_ratios, key=lambda s_ratio: abs(s_ratio - 1.0))
     if abs(worst_variance_ratio - 1.0) > MAX_INNOVATION_VARIANCE_RATIO_DEVIATION:
@@ -532,6 +551,7 @@ def _judge_agreement(
             f"(limit 1 ± {MAX_INNOVATION_VARIANCE_RATIO_DEVIATION:.2f}): "
             "EKF2 fused samples that are not in the log"
         )
+    # 2. Innovations and positions
     min_correlation = min(axis.innovation_correlation for axis in axes.values())
     correlation_text = (
         f"replayed and logged innovations have a correlation of {min_correlation:.4f}"
@@ -546,6 +566,7 @@ def _judge_agreement(
                 f"(limit {max_difference_m:g} m): the log lacks data of EKF2's output predictor"
             )
         return True, correlation_text
+    # 3. Rejections
     if (
         max(rejected_fraction_logged, rejected_fraction_replayed)
         < MAX_REJECTED_FRACTION_FOR_COMPARISON

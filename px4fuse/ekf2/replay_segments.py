@@ -24,6 +24,7 @@ from px4fuse.core.arrays import (
     compute_median_interval_s,
     cumulative_sums,
     interpolate_columns,
+    select_intervals,
 )
 from px4fuse.core.record import Span
 from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
@@ -94,7 +95,8 @@ STATE_COUNT = 15
 MOTION_STATE_COUNT = 9
 # State indices of attitude error, velocity, position and biases
 THETA, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
-GYRO_BIAS, ACCELEROMETER_BIAS, BIASES = slice(9, 12), slice(12, 15), slice(9, 15)
+GYRO_BIAS, ACCELEROMETER_BIAS = slice(9, 12), slice(12, 15)
+HORIZONTAL_VELOCITY, HORIZONTAL_POSITION = slice(3, 5), slice(6, 8)
 # State indices of the earth field (NED) and the body field (FRD), if there are 21 states
 EARTH_MAGNETIC_FIELD, BODY_MAGNETIC_FIELD = slice(15, 18), slice(18, 21)
 
@@ -272,20 +274,22 @@ def group_samples_by_event(
         event (s); further quantities; 1 for a sample, 0 for padding. The positions are corrected
         with the IMU, so that each measures position - age · velocity at the event.
     """
+    # 1. Event of each sample. Samples after the last event are not used
     event_indices = np.searchsorted(event_steps, measurement_step_indices)
     # Samples that are measured after the last event are not fused
     sample_count = int(np.searchsorted(event_indices, len(event_steps)))
-    event_indices, measurement_step_indices = (
-        event_indices[:sample_count],
-        measurement_step_indices[:sample_count],
-    )
+    event_indices = event_indices[:sample_count]
+    measurement_steps = measurement_step_indices[:sample_count]
     event_step = event_steps[event_indices]
-    age_s = segment.time_s[event_step] - segment.time_s[measurement_step_indices]
+    age_s = segment.time_s[event_step] - segment.time_s[measurement_steps]
+    # 2. Correction for accelerations: movement from measurement to event, minus age · velocity at
+    # the event. The unknown initial velocity of the integrated IMU cancels
     displacement_m = (
         segment.imu_displacement_m[event_step]
-        - segment.imu_displacement_m[measurement_step_indices]
+        - segment.imu_displacement_m[measurement_steps]
         - segment.imu_velocity_change_m_s[event_step] * age_s[:, None]
     )
+    # 3. Index of each sample in its event: its row minus the first row of the event
     index_in_event = np.arange(sample_count) - np.searchsorted(event_indices, event_indices)
     columns = (
         *(position_m[:sample_count] + displacement_m[:, axes]).T,
@@ -305,8 +309,11 @@ def make_update_table(
 
     Parameters
     ----------
-    update_records : ndarray, shape (events, k, ...)
-        Innovations, variances, and further columns of up to k samples; NaN without a sample.
+    update_records : ndarray, shape (events, k, columns)
+        Records of up to k samples; NaN without a sample. The columns are innovations (one for each
+        axis), innovation variances, rejected, fused, reset, position variances and observation
+        variances. The last of them may be missing: GNSS velocity ends with rejected, heights with
+        fused, vision in addition to GNSS with reset.
     measurement_times_s : ndarray, shape (events, k)
     end_s : ndarray, shape (events,)
         Time of each event.
@@ -327,7 +334,8 @@ def make_update_table(
         time_index(measurement_times_s[has_innovation]),
         columns[: update_records.shape[-1]],
     )
-    return updates.assign(fused_at_s=end_s[np.nonzero(has_innovation)[0]])
+    event_indices, _ = np.nonzero(has_innovation)
+    return updates.assign(fused_at_s=end_s[event_indices])
 
 
 def stack_samples(samples_by_filter: Sequence[Array]) -> Array:
@@ -356,32 +364,37 @@ def find_replay_segments(
     *,
     is_gnss: bool,
 ) -> tuple[ReplaySegment, ...]:
-    """Find the parts of a flight without gaps in IMU and positions, after EKF2's first fusion."""
+    """Find the parts of a flight without gaps in IMU and positions, after EKF2's first fusion.
+
+    Each part is replayed from a logged state. ``position_times_s`` are the times (s) of all
+    horizontal aiding samples.
+    """
     innovations = ekf2.innovations["north"]
     assert isinstance(innovations, pd.DataFrame)
     state_times_s = fusion_record.delayed_state.index.to_numpy()
     imu_times_s = imu.index.to_numpy()
-    # Times at which the replay ends and restarts: ends of the IMU data, another primary EKF2
-    # instance (with another state), and start and end of each gap
-    boundary_times_s = [imu_times_s[0], imu_times_s[-1]]
-    boundary_times_s += [time_s for time_s, _ in ekf2.primary_instances[1:]]
-    for sample_times_s, limit in ((imu_times_s, MIN_IMU_GAP_S), (position_times_s, RESTART_GAP_S)):
-        is_gap = np.diff(sample_times_s) > limit
-        boundary_times_s += [*sample_times_s[:-1][is_gap], *sample_times_s[1:][is_gap]]
     magnetic_field_start_s = magnetic_field_end_s = np.inf
     if is_gnss:
-        boundary_times_s += _find_interruption_times_s(imu, ekf2)
         magnetic_field_start_s, magnetic_field_end_s = _find_magnetometer_3d_fusion_span(
             fusion_record
         )
     parameter_changes = [
         change for change in ekf2.parameter_changes if change.name in MODEL_PARAMETERS
     ]
-    boundary_times_s += [magnetic_field_end_s, *(change.time_s for change in parameter_changes)]
+    boundary_times_s = [
+        *_find_data_boundary_times_s(imu_times_s, position_times_s),
+        *(_find_interruption_times_s(imu, ekf2) if is_gnss else ()),
+        # Another primary EKF2 instance has another state
+        *(time_s for time_s, _ in ekf2.primary_instances[1:]),
+        *(change.time_s for change in parameter_changes),
+        magnetic_field_end_s,
+    ]
     # The replay can start up to MIN_IMU_GAP_S before the first IMU sample. It can end up to
     # MIN_IMU_GAP_S after the last IMU sample, and 1 s after the last position
     earliest_start_s = max(attitude.index[0], imu_times_s[0] - MIN_IMU_GAP_S, position_times_s[0])
-    end_s = min(attitude.index[-1], imu_times_s[-1] + MIN_IMU_GAP_S, position_times_s[-1] + 1.0)
+    latest_end_s = min(
+        attitude.index[-1], imu_times_s[-1] + MIN_IMU_GAP_S, position_times_s[-1] + 1.0
+    )
     takeoff_s = -np.inf
     if not isinstance(flight.airborne, Unavailable) and flight.airborne:
         takeoff_s = flight.airborne[0][0]
@@ -392,8 +405,9 @@ def find_replay_segments(
 
     segments = []
     for part_start_s, part_end_s in pairwise(
-        np.unique(np.clip(boundary_times_s, earliest_start_s, end_s))
+        np.unique(np.clip(boundary_times_s, earliest_start_s, latest_end_s))
     ):
+        # 1. Earliest start: EKF2 has fused positions, flies, and has magnetic field states
         fusion_times_in_part_s = rows_between(innovations, part_start_s, part_end_s).index
         if not len(fusion_times_in_part_s):
             continue
@@ -402,41 +416,45 @@ def find_replay_segments(
             start_s = max(start_s, takeoff_s + MIN_TIME_SINCE_TAKEOFF_S)
         if part_start_s <= magnetic_field_start_s < part_end_s:
             start_s = max(start_s, magnetic_field_start_s)
+        # 2. Start at the first logged state after this time
         start_row = int(np.searchsorted(state_times_s, start_s))
-        # The replay starts from a logged state
-        if (
-            start_row == len(state_times_s)
-            or part_end_s - state_times_s[start_row] < MIN_SEGMENT_DURATION_S
-        ):
+        if start_row == len(state_times_s):
+            continue
+        start_s = state_times_s[start_row]
+        if part_end_s - start_s < MIN_SEGMENT_DURATION_S:
             continue
         # The part between two boundary times may itself be a gap of the IMU data
-        is_covered = (imu_times_s[1:] > state_times_s[start_row]) & (imu_times_s[:-1] < part_end_s)
+        is_covered = (imu_times_s[1:] > start_s) & (imu_times_s[:-1] < part_end_s)
         if not np.all(np.diff(imu_times_s)[is_covered] <= MIN_IMU_GAP_S):
             continue
+        # 3. Preceding seconds, for the correlations of the initial state
+        preceding_segment = None
+        preceding_start_s = max(earliest_start_s, start_s - CORRELATION_ESTIMATION_TIME_S)
+        preceding_start_row = int(np.searchsorted(state_times_s, preceding_start_s))
+        if preceding_start_row < start_row:
+            preceding_segment = make_segment(preceding_start_row, start_s)
         segment = replace(
             make_segment(start_row, part_end_s),
+            preceding_segment=preceding_segment,
             changed_parameters={
                 change.name: change.value_after
                 for change in parameter_changes
                 if change.time_s <= part_start_s
             },
         )
-        preceding_start_row = int(
-            np.searchsorted(
-                state_times_s,
-                max(earliest_start_s, state_times_s[start_row] - CORRELATION_ESTIMATION_TIME_S),
-            )
-        )
-        if preceding_start_row < start_row:
-            preceding_segment = make_segment(preceding_start_row, state_times_s[start_row])
-            segment = replace(segment, preceding_segment=preceding_segment)
-        if (
-            magnetic_field_start_s <= state_times_s[start_row]
-            and part_end_s <= magnetic_field_end_s
-        ):
+        if magnetic_field_start_s <= start_s and part_end_s <= magnetic_field_end_s:
             segment = _add_magnetic_field(segment, fusion_record, start_row, ekf2.step_s)
         segments.append(segment)
     return tuple(segments)
+
+
+def _find_data_boundary_times_s(imu_times_s: Array, position_times_s: Array) -> list[float]:
+    """Return the ends (s) of the IMU data, and start and end of each gap of IMU or positions."""
+    boundary_times_s = [imu_times_s[0], imu_times_s[-1]]
+    for times_s, max_gap_s in ((imu_times_s, MIN_IMU_GAP_S), (position_times_s, RESTART_GAP_S)):
+        for gap in select_intervals(times_s, np.diff(times_s) > max_gap_s):
+            boundary_times_s += gap
+    return boundary_times_s
 
 
 def _add_gnss_model_inputs(
@@ -449,9 +467,11 @@ def _add_gnss_model_inputs(
     initial_state = segment.state.copy()
     initial_state[POSITION] *= internal_to_published_position_ratio
     earth_rotation_rad = compute_earth_rate_rad_s(fusion_record) * segment.step_s[:, None]
-    start_s, end_s = span_s = segment.time_s[[0, -1]]
-    velocity_change_m_s = np.diff(np.interp(span_s, ekf2.state.index, ekf2.state["down_m_s"]))[0]
-    velocity_change_error_m_s = segment.imu_velocity_change_m_s[-1, 2] - velocity_change_m_s
+    # Mean vertical bias: vertical velocity change from the IMU minus that of EKF2, per time
+    start_s, end_s = segment.time_s[[0, -1]]
+    start_m_s, end_m_s = np.interp([start_s, end_s], ekf2.state.index, ekf2.state["down_m_s"])
+    _, _, imu_change_down_m_s = segment.imu_velocity_change_m_s[-1]
+    velocity_change_error_m_s = imu_change_down_m_s - (end_m_s - start_m_s)
     return replace(
         segment,
         state=initial_state,
@@ -536,6 +556,7 @@ def _make_segment(
     end_s: float,
 ) -> ReplaySegment:
     """Make the segment from a row of ``estimator_states`` to ``end_s``."""
+    # 1. IMU samples of the segment, and the last sample of each prediction step
     initial_row = fusion_record.delayed_state.iloc[start_row].astype(np.float64)
     imu_times_s = imu.index.to_numpy()
     first_row = int(np.argmin(np.abs(imu_times_s - fusion_record.delayed_state.index[start_row])))
@@ -549,6 +570,8 @@ def _make_segment(
     step_end_indices = find_step_ends(
         imu_intervals_s, logged_step_end_indices, read_prediction_step_s(fusion_record)
     )
+    # 2. Rotation and velocity change of each step, without the logged (nominal) biases. An IMU
+    # sample is the mean over the interval before it
     accelerometer_bias = np.asarray(initial_row[Columns.ACCELEROMETER_BIAS])
     gyro_bias = np.asarray(initial_row[Columns.GYRO_BIAS])
     rotation_vectors, velocity_increments = downsample_imu(
@@ -559,7 +582,8 @@ def _make_segment(
     )
     step_times_s = imu_times_s[np.append(0, step_end_indices)]
     step_s = np.diff(step_times_s)
-    # Attitude relative to the start, from the gyro alone
+    # 3. Nominal attitude: EKF2's published attitude, interpolated with the gyro. gyro_attitude is
+    # the attitude relative to the start, from the gyro alone
     gyro_attitude = cumulative_product(
         np.concatenate([[[1.0, 0.0, 0.0, 0.0]], from_rotation_vector(rotation_vectors)])
     )
@@ -586,11 +610,13 @@ def _make_segment(
         step_times_s, *compute_rotation_from_end_attitude(attitude, 0.0, gyro_attitude)
     )
     nominal_attitude = multiply(rotation_to_published_attitude, gyro_attitude)
-    # The first state row may be up to 0.1 ms before the first IMU sample
+    # 4. Error of the nominal attitude, from the attitude in the logged states. The first state row
+    # may be up to 0.1 ms before the first IMU sample
     state_times_s, error_quaternions = compute_rotation_from_end_attitude(
         fusion_record.delayed_state, 1e-4, nominal_attitude
     )
     attitude_error_rad = to_rotation_vector(error_quaternions)
+    # 5. Initial position: that of the logged state, or the published position
     published_position_m = _interpolate(ekf2.state[Columns.POSITION], step_times_s[:1])[0]
     position_m = initial_row[Columns.POSITION].to_numpy()
     position_m = np.where(np.isfinite(position_m), position_m, published_position_m)
@@ -663,26 +689,26 @@ def _add_magnetic_field(
     sample_times_s = field_gauss.index.to_numpy()
     # EKF2 subtracts its delay parameter and half a prediction step from the sample times
     age_s = fusion_record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
-    fused_samples_per_row = max(MAG_FUSION_HZ * compute_median_interval_s(sample_times_s), 1.0)
     measurement_times_s = sample_times_s - age_s
-    segment_with_magnetic_field_states = add_magnetic_field_states(
-        segment,
-        measurement_times_s,
-        field_gauss.iloc[:, :3].to_numpy(),
-        fused_samples_per_row,
-        np.asarray(initial_row[[*Columns.EARTH_MAGNETIC_FIELD, *Columns.BODY_MAGNETIC_FIELD]]),
-        np.asarray(initial_row[Columns.FUSION_HORIZON_VARIANCE[-6:]]),
-    )
-    if Columns.MAGNETIC_FIELD_INNOVATION[0] not in field_gauss:
-        return segment_with_magnetic_field_states
-    return replace(
-        segment_with_magnetic_field_states,
-        magnetic_field=_compute_mean_magnetic_field(
+    if Columns.MAGNETIC_FIELD_INNOVATION[0] in field_gauss:
+        samples = _compute_mean_magnetic_field(
             segment,
             fusion_record.delayed_state,
             measurement_times_s,
             field_gauss[Columns.MAGNETIC_FIELD_INNOVATION].to_numpy(),
-        ),
+        )
+    else:
+        samples = make_magnetic_field_samples(
+            segment,
+            measurement_times_s,
+            field_gauss.iloc[:, :3].to_numpy(),
+            max(MAG_FUSION_HZ * compute_median_interval_s(sample_times_s), 1.0),
+        )
+    return add_magnetic_field_states(
+        segment,
+        samples,
+        np.asarray(initial_row[[*Columns.EARTH_MAGNETIC_FIELD, *Columns.BODY_MAGNETIC_FIELD]]),
+        np.asarray(initial_row[Columns.FUSION_HORIZON_VARIANCE[-6:]]),
     )
 
 
@@ -697,34 +723,32 @@ def _compute_mean_magnetic_field(
     Mean field = predicted field - mean innovation. The mean innovation is computed from logged
     low-pass filtered innovations.
     """
-    row_interval_s = np.diff(measurement_times_s)
-    is_inside = (measurement_times_s[:-1] > segment.time_s[0]) & (
-        measurement_times_s[1:] <= segment.time_s[-1]
-    )
-    gap_free_rows = (
-        np.flatnonzero(is_inside & (row_interval_s > 0.0) & (row_interval_s < RESTART_GAP_S)) + 1
-    )
-    measurement_times_s = measurement_times_s[gap_free_rows]
-    row_interval_s = row_interval_s[gap_free_rows - 1]
-    fused_sample_counts = np.maximum(np.rint(MAG_FUSION_HZ * row_interval_s), 1.0)
-    new_sample_weight = row_interval_s / (
-        row_interval_s + fused_sample_counts * INNOVATION_LOW_PASS_TIME_CONSTANT_S
-    )
-    previous_innovation_weight = ((1.0 - new_sample_weight) ** fused_sample_counts)[:, None]
-    unfiltered_field_innovation_gauss = (
-        filtered_field_innovation_gauss[gap_free_rows]
-        - previous_innovation_weight * filtered_field_innovation_gauss[gap_free_rows - 1]
-    ) / (1.0 - previous_innovation_weight)
+    # 1. Pairs of successive rows in the segment, without gaps
+    start_times_s, end_times_s = measurement_times_s[:-1], measurement_times_s[1:]
+    row_interval_s = end_times_s - start_times_s
+    is_used = (start_times_s > segment.time_s[0]) & (end_times_s <= segment.time_s[-1])
+    is_used &= (row_interval_s > 0.0) & (row_interval_s < RESTART_GAP_S)
+    end_times_s, row_interval_s = end_times_s[is_used], row_interval_s[is_used]
+    # 2. Mean innovation between two rows. EKF2 updates the filtered innovation f with each of n
+    # samples ν: f = (1 - w) f + w ν. With a constant ν and p = (1 - w)^n: f = p f_previous +
+    # (1 - p) ν
+    sample_counts = np.maximum(np.rint(MAG_FUSION_HZ * row_interval_s), 1.0)
+    sample_interval_s = row_interval_s / sample_counts
+    w = sample_interval_s / (sample_interval_s + INNOVATION_LOW_PASS_TIME_CONSTANT_S)
+    previous_weight = ((1.0 - w) ** sample_counts)[:, None]
+    mean_innovation_gauss = (
+        filtered_field_innovation_gauss[1:][is_used]
+        - previous_weight * filtered_field_innovation_gauss[:-1][is_used]
+    ) / (1.0 - previous_weight)
+    # 3. Predicted field: mean over the n samples (index i) of each row (index k), with their
+    # weights in the filter, of C (earth field - δθ × earth field) + body field. C is the nominal
+    # rotation from NED to body, δθ the attitude error
     step_indices, weight = compute_low_pass_weights(
-        segment,
-        measurement_times_s,
-        fused_sample_counts,
-        row_interval_s / fused_sample_counts,
-        new_sample_weight,
+        segment, end_times_s, sample_counts, sample_interval_s, w
     )
     ned_to_body_rotation = segment.body_to_ned[step_indices].swapaxes(2, 3)
     earth_field_gauss, body_field_gauss = (
-        _interpolate(delayed_state[names], measurement_times_s)
+        _interpolate(delayed_state[names], end_times_s)
         for names in (Columns.EARTH_MAGNETIC_FIELD, Columns.BODY_MAGNETIC_FIELD)
     )
     earth_field_with_attitude_error_gauss = earth_field_gauss[:, None] - np.cross(
@@ -736,13 +760,12 @@ def _compute_mean_magnetic_field(
         )
         + body_field_gauss
     )
-    mean_rotation_to_body = np.einsum("ki,kiab->kab", weight, ned_to_body_rotation)
     return SensorSamples(
-        step_indices[:, 0],
-        expected_field_gauss - unfiltered_field_innovation_gauss,
-        mean_rotation_to_body,
-        fused_sample_counts,
-        np.zeros(len(gap_free_rows)),
+        step_indices[:, 0],  # step of the newest sample
+        expected_field_gauss - mean_innovation_gauss,
+        np.einsum("ki,kiab->kab", weight, ned_to_body_rotation),
+        sample_counts,
+        np.zeros(len(sample_counts)),
     )
 
 
@@ -752,7 +775,7 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     The logged velocity is low-pass filtered. The replay fuses the mean velocity between two logged
     samples. ``gate`` is the innovation gate (√S).
     """
-    # Time of the first sample in each mean
+    # 1. Means in the segment. begin_s: time of the first sample in each mean
     begin_s = flow.index - (flow["samples"] - 1.0) * flow["interval_s"]
     flow = flow[(begin_s > segment.time_s[0]) & (flow.index <= segment.time_s[-1])]
     sample_count = flow["samples"].to_numpy()
@@ -760,7 +783,7 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     step_index, weight = compute_low_pass_weights(
         segment, flow.index.to_numpy(), sample_count, interval_s, FLOW_FILTER_NEW_SAMPLE_WEIGHT
     )
-    # Rotation from NED to the body axes forward and right
+    # 2. Rotation from NED to the axes forward and right: the first two rows
     ned_to_body_rotation = segment.body_to_ned[step_index].swapaxes(2, 3)[:, :, :2]
     # For each mean (k) of flow samples (i): weighted mean of the velocity change from the IMU since
     # the start of the segment, in body axes. Without this velocity change, all samples of a mean
@@ -812,28 +835,38 @@ def compute_low_pass_weights(
     return np.searchsorted(segment.time_s, measurement_times_s - 1e-9), weight
 
 
+def make_magnetic_field_samples(
+    segment: ReplaySegment, measurement_times_s: Array, field_gauss: Array, sample_weight: float
+) -> SensorSamples:
+    """Return magnetometer samples of a segment from m logged samples (body FRD).
+
+    ``measurement_times_s``, shape (m,), are EKF2's measurement times. Each logged sample represents
+    ``sample_weight`` EKF2 samples.
+    """
+    step_index, is_inside = find_sample_steps(segment, measurement_times_s)
+    sample_count = len(step_index)
+    return SensorSamples(
+        step_index,
+        field_gauss[is_inside],
+        segment.body_to_ned[step_index].transpose(0, 2, 1),
+        np.full(sample_count, sample_weight),
+        np.zeros(sample_count),
+    )
+
+
 def add_magnetic_field_states(
     segment: ReplaySegment,
-    measurement_times_s: Array,
-    field_gauss: Array,
-    sample_weight: float,
+    samples: SensorSamples,
     initial_fields_gauss: Array,
     field_variance_gauss2: Array,
 ) -> ReplaySegment:
-    """Add the magnetic fields of earth and body to the states.
+    """Add magnetometer samples, and the magnetic fields of earth and body as states.
 
     Parameters
     ----------
-    measurement_times_s, field_gauss : ndarray, shape (m,) and (m, 3)
-        Magnetometer samples (body FRD) at EKF2's measurement time.
-    sample_weight : float
-        Number of EKF2 samples that each logged sample represents.
     initial_fields_gauss, field_variance_gauss2 : ndarray, shape (6,)
         Initial fields of earth (NED) and body (FRD), and their variances.
     """
-    step_index, is_inside = find_sample_steps(segment, measurement_times_s)
-    ned_to_body_rotation = segment.body_to_ned[step_index].transpose(0, 2, 1)
-    sample_count = len(step_index)
     return replace(
         segment,
         state=np.concatenate([segment.state, initial_fields_gauss]),
@@ -841,13 +874,7 @@ def add_magnetic_field_states(
         initial_state_correlation=block_diag(
             segment.initial_state_correlation, np.eye(len(initial_fields_gauss))
         ),
-        magnetic_field=SensorSamples(
-            step_index,
-            field_gauss[is_inside],
-            ned_to_body_rotation,
-            np.full(sample_count, sample_weight),
-            np.zeros(sample_count),
-        ),
+        magnetic_field=samples,
     )
 
 
@@ -894,8 +921,8 @@ def find_step_ends(
     ):
         accumulated_count += sample_count
         accumulated_time_s += interval
-        # A prediction step ends after a number of IMU samples, at a time limit, or at a logged EKF2
-        # state
+        # A step ends after a number of samples in more than half the configured time, after the
+        # configured time, or where the log contains a state (imu_down_sampler.cpp)
         if (
             (accumulated_count >= samples_per_step and accumulated_time_s > 0.5 * configured_step_s)
             or accumulated_time_s > configured_step_s

@@ -9,9 +9,8 @@ becomes a state before EKF2's process noise is used.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -40,6 +39,7 @@ from .replay import (
     interpolate_component,
     is_inside_spans,
     rows_inside,
+    subtract_states,
 )
 
 DIFFERENCE_ANALYSIS_NAME = "difference KF - EKF2"
@@ -187,8 +187,8 @@ def explain_difference_by_replacements(
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
     configurations = make_replacement_configurations(model.inputs, settings)
-    # The last configuration is not run here: baseline_replay contains its track
-    fusion_horizon_tracks = compute_delayed_tracks(model, [*configurations.values()][:-1])
+    # baseline_replay contains the track of this configuration
+    del configurations[REJECTION_REPLACEMENT_NAME]
     baseline_replay = replay_with_logged_rejections(model)
     evaluated_spans = model.baseline_replay.find_evaluated_spans()
     state_times_s = ekf2.state.index.to_numpy()
@@ -207,107 +207,117 @@ def explain_difference_by_replacements(
             "Analyse a segment in which EKF2 fused the position source (--start, --end).",
         )
     state_span_s = float(state_times_s[0]), float(state_times_s[-1])
-    replacement_names = (*configurations, OUTPUT_PREDICTOR_REPLACEMENT_NAME)
-    # Only the tracks of the last two properties (rejections, output predictor) contain EKF2's
-    # rejections
-    *_, last_property_without_gate, _, _ = replacement_names
-    # Position and velocity of each track along each axis
-    states_by_track = []
-    # Tracks are computed one at a time, to limit the memory
-    tracks = chain(
-        fusion_horizon_tracks,
-        (baseline_replay.delayed_state, baseline_replay.published_state, ekf2.state),
-    )
-    for replacement_name, track in zip((*replacement_names, "EKF2 as logged"), tracks, strict=True):
-        states_by_track.append(
-            [
+
+    def select_states(track: pd.DataFrame) -> dict[str, Array]:
+        """Return position and velocity of a track along each axis, shape (2, n)."""
+        return {
+            axis: np.array(
                 [
                     interpolate_component(track, columns, run.axis.direction, state_times_s)
                     for columns in (Columns.POSITION, Columns.VELOCITY)
                 ]
-                for run in kf_runs.values()
-            ]
-        )
-        if replacement_name == last_property_without_gate:
-            replay_track_without_gate = track
-    spans = Segment(*state_span_s, "").clip_spans(evaluated_spans)
+            )
+            for axis, run in kf_runs.items()
+        }
+
+    # Tracks are computed one at a time, to limit the memory
+    states_by_replacement = {}
+    tracks = compute_delayed_tracks(model, [*configurations.values()])
+    for name, track in zip(configurations, tracks, strict=True):
+        states_by_replacement[name] = select_states(track)
+    # The last track contains all replacements except EKF2's rejections and output predictor
     longest_rejection = _find_longest_rejection(
-        baseline_replay, replay_track_without_gate, state_span_s, evaluated_spans
+        baseline_replay, track, state_span_s, evaluated_spans
     )
-    explanations = {}
-    for (axis, kf_run), axis_components in zip(
-        kf_runs.items(), np.swapaxes(states_by_track, 0, 1), strict=True
-    ):
-        kf_state = predict_track(kf_run, state_times_s)[STATE_COLUMNS].to_numpy().T
-        explanations[axis] = _explain_difference_along_axis(
+    states_by_replacement |= {
+        REJECTION_REPLACEMENT_NAME: select_states(baseline_replay.delayed_state),
+        OUTPUT_PREDICTOR_REPLACEMENT_NAME: select_states(baseline_replay.published_state),
+    }
+    logged_states = select_states(ekf2.state)
+    spans = Segment(*state_span_s, "").clip_spans(evaluated_spans)
+    return {
+        axis: _explain_difference_along_axis(
             model.flight,
             kf_run.axis.direction,
-            replacement_names,
             state_times_s,
-            np.array([kf_state, *axis_components]),
+            predict_track(kf_run, state_times_s)[STATE_COLUMNS].to_numpy().T,
+            {name: states[axis] for name, states in states_by_replacement.items()},
+            logged_states[axis],
             spans,
             longest_rejection,
         )
-    return explanations
+        for axis, kf_run in kf_runs.items()
+    }
 
 
 def _explain_difference_along_axis(
     flight: Flight,
     direction: Array,
-    replacement_names: Sequence[str],
     times_s: Array,
-    states_by_track: Array,
+    kf_state: Array,
+    states_by_replacement: Mapping[str, Array],
+    logged_state: Array,
     spans_s: Spans,
     longest_rejection: RejectionSeries | None,
 ) -> DifferenceExplanation:
-    """Divide the mean square difference KF - EKF2 along one axis among k properties.
+    """Divide the mean square difference KF - EKF2 along one axis among the replaced properties.
 
-    ``states_by_track``, shape (k + 2, 2, n), contains position and velocity of k + 2 tracks at n
-    times. The first track is KF. In each of the next k tracks, one more property of KF is replaced
-    by that of EKF2. The last track is the logged EKF2.
+    Each state contains position and velocity at n times, shape (2, n).
+
+    Parameters
+    ----------
+    kf_state, logged_state : ndarray
+        States of KF and of the logged EKF2.
+    states_by_replacement : mapping from name to ndarray
+        States after each replacement, in the order of the replacements.
     """
-    differences_by_track = states_by_track - states_by_track[-1]
-    rmse_by_track = [
-        compute_rmse_to_truth(flight, track, direction, times_s) for track in states_by_track[:, 0]
-    ]
-    mean_square_differences = np.mean(differences_by_track[:-1] ** 2, axis=2)
-    position_change = np.abs(np.diff(states_by_track[:-1, 0], axis=0))
-    steps = tuple(
-        PropertyReplacement(
-            name=name,
-            position_mean_square_m2=position_reduction,
-            velocity_mean_square_m2_s2=velocity_reduction,
-            position_moved_m=float(position_change_m.max()),
-            moved_at_s=float(times_s[position_change_m.argmax()]),
-            position_rmse_to_truth_m=rmse_m,
+
+    def compute_mean_squares(state: Array) -> Array:
+        """Return the mean square differences of position and velocity from the logged EKF2."""
+        return np.asarray(np.mean((state - logged_state) ** 2, axis=1))
+
+    def compute_rmse(state: Array) -> float | None:
+        return compute_rmse_to_truth(flight, state[0], direction, times_s)
+
+    steps = []
+    state = kf_state
+    for name, replaced_state in states_by_replacement.items():
+        reductions = compute_mean_squares(state) - compute_mean_squares(replaced_state)
+        position_change_m = np.abs(replaced_state[0] - state[0])
+        steps.append(
+            PropertyReplacement(
+                name=name,
+                position_mean_square_m2=float(reductions[0]),
+                velocity_mean_square_m2_s2=float(reductions[1]),
+                position_moved_m=float(position_change_m.max()),
+                moved_at_s=float(times_s[position_change_m.argmax()]),
+                position_rmse_to_truth_m=compute_rmse(replaced_state),
+            )
         )
-        for name, (position_reduction, velocity_reduction), position_change_m, rmse_m in zip(
-            replacement_names,
-            (mean_square_differences[:-1] - mean_square_differences[1:]).tolist(),
-            position_change,
-            rmse_by_track[1:-1],
-            strict=True,
-        )
-    )
-    initial_mean_squares, *_, unexplained_mean_squares = mean_square_differences.tolist()
+        state = replaced_state
+    position_mean_square_m2, velocity_mean_square_m2_s2 = compute_mean_squares(kf_state).tolist()
+    # ``state`` is now the state after all replacements
+    unexplained_m2, unexplained_m2_s2 = compute_mean_squares(state).tolist()
     missing_truth_reason = NO_TRUTH_OVERLAP if isinstance(flight.truth, Truth) else flight.truth
     return DifferenceExplanation(
         count=len(times_s),
-        position_mean_square_m2=initial_mean_squares[0],
-        velocity_mean_square_m2_s2=initial_mean_squares[1],
-        steps=steps,
-        unexplained_mean_square_m2=unexplained_mean_squares[0],
-        unexplained_velocity_mean_square_m2_s2=unexplained_mean_squares[1],
+        position_mean_square_m2=position_mean_square_m2,
+        velocity_mean_square_m2_s2=velocity_mean_square_m2_s2,
+        steps=tuple(steps),
+        unexplained_mean_square_m2=unexplained_m2,
+        unexplained_velocity_mean_square_m2_s2=unexplained_m2_s2,
         position_rmse_to_truth_m={
             name: missing_truth_reason if rmse_m is None else rmse_m
-            for name, rmse_m in (("kf", rmse_by_track[0]), ("ekf2", rmse_by_track[-1]))
+            for name, rmse_m in (
+                ("kf", compute_rmse(kf_state)),
+                ("ekf2", compute_rmse(logged_state)),
+            )
         },
         spans_s=spans_s,
         longest_rejection=longest_rejection,
         times_s=times_s,
-        # Copy the rows, because a view would keep the whole array in memory
-        kf_minus_ekf2_m=differences_by_track[0, 0].copy(),
-        unexplained_difference_m=differences_by_track[-2, 0].copy(),
+        kf_minus_ekf2_m=kf_state[0] - logged_state[0],
+        unexplained_difference_m=state[0] - logged_state[0],
     )
 
 
@@ -321,6 +331,8 @@ def make_replacement_configurations(
     replaced properties.
     """
     logged_settings, aid = inputs.settings, inputs.aid
+    # The acceleration error is constant in a time step: n shorter steps give the same velocity
+    # variance with √n times the noise
     kf_process_noise = {
         "EKF2_ACC_NOISE": kf_settings.sigma_a_m_s2
         * math.sqrt(kf_settings.dt_s / inputs.mean_step_s)
@@ -328,13 +340,10 @@ def make_replacement_configurations(
     kf_noises = {**kf_process_noise, aid.noise: kf_settings.sigma_z_m}
     # The delay is already subtracted from KF's GNSS times, but not from the replay's timestamps
     applied_delay_s = logged_settings[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
-    replayed_aids = list_modelled_aids(inputs)[1:]
-    property_by_aid = {
-        name: replacement_name
-        for name, replacement_name in REPLACEMENT_NAME_BY_ADDITIONAL_AID.items()
-        if name in replayed_aids
-    }
-    additional_aids = [*property_by_aid]
+    # The first source is the position source
+    other_aids = list_modelled_aids(inputs)[1:]
+    additional_aids = [name for name in REPLACEMENT_NAME_BY_ADDITIONAL_AID if name in other_aids]
+    # 1. KF with the sample times of EKF2: all sources except the position are disabled from 0 s on
     configuration = FilterConfiguration(
         {**logged_settings, **kf_noises, **dict.fromkeys(aid.lever_arm, 0.0)},
         estimates_biases=False,
@@ -360,16 +369,18 @@ def make_replacement_configurations(
         PROCESS_NOISE_REPLACEMENT_NAME: {"settings": logged_settings},
         ATTITUDE_REPLACEMENT_NAME: {"estimates_attitude": True},
     }
-    if MAG.name in replayed_aids:
+    if MAG.name in other_aids:
         replacements[MAGNETOMETER_REPLACEMENT_NAME] = {
             "disable_time_s_by_aid": dict.fromkeys(additional_aids, 0.0)
         }
-    if GNSS_VEL.name in replayed_aids:
+    if GNSS_VEL.name in other_aids:
         replacements[GNSS_VELOCITY_REPLACEMENT_NAME] = {"fuses_velocity": True}
-    for next_index, name in enumerate(property_by_aid.values(), start=1):
-        replacements[name] = {
-            "disable_time_s_by_aid": dict.fromkeys(additional_aids[next_index:], 0.0)
+    # Enable the additional sources one after the other; those after ``name`` stay disabled
+    for index, name in enumerate(additional_aids):
+        replacements[REPLACEMENT_NAME_BY_ADDITIONAL_AID[name]] = {
+            "disable_time_s_by_aid": dict.fromkeys(additional_aids[index + 1 :], 0.0)
         }
+    # 3. One configuration per replacement. The last is EKF2 with its logged decisions
     configurations = {SAMPLE_TIMES_REPLACEMENT_NAME: configuration}
     for name, changes in replacements.items():
         configuration = replace(configuration, **changes)
@@ -405,19 +416,12 @@ def _find_longest_rejection(
     begin_s = fusion_times_s[run_starts[longest_index]]
     # If the longest series continues to the end of the flight, there is no next fused sample
     end_s = fusion_times_s[min(run_ends[longest_index], len(fusion_times_s) - 1)]
-    fusion_horizon_track = baseline_replay.delayed_state.loc[begin_s:end_s]
-    position_difference = [
-        fusion_horizon_track[column]
-        - np.interp(
-            fusion_horizon_track.index,
-            fusion_horizon_track_without_gate.index,
-            fusion_horizon_track_without_gate[column],
-        )
-        for column in Columns.POSITION[:2]
-    ]
+    difference = subtract_states(
+        fusion_horizon_track_without_gate, baseline_replay.delayed_state.loc[begin_s:end_s]
+    )
     return RejectionSeries(
         start_s=float(begin_s),
         samples=int(run_ends[longest_index] - run_starts[longest_index]),
         duration_s=float(end_s - begin_s),
-        distance_m=float(np.max(np.hypot(*position_difference))),
+        distance_m=float(np.hypot(difference["north_m"], difference["east_m"]).max()),
     )

@@ -19,13 +19,13 @@ from .filter_batch import FilterBatch, FilterConfiguration
 from .heights import MIN_INNOVATION_GATE, MIN_MEASUREMENT_NOISE_SIGMA
 from .intervals import MAX_DELAY_BEHIND_HORIZON_S
 from .replay_segments import (
+    HORIZONTAL_POSITION,
+    HORIZONTAL_VELOCITY,
     group_samples_by_event,
     make_update_table,
     stack_samples,
 )
 
-# State indices of horizontal velocity and horizontal position
-HORIZONTAL_VELOCITY, HORIZONTAL_POSITION = slice(3, 5), slice(6, 8)
 # EKF2 stops vision fusion after this time (s) without a sample (2 EV_MAX_INTERVAL, ev_control.cpp)
 MAX_SAMPLE_GAP_S = 0.4
 # EKF2 resets the vision bias or the position after this time (s) with only rejected samples:
@@ -47,6 +47,7 @@ def _group_vision_by_event(
     inputs, segment, settings = batch.inputs, batch.segment, configuration.settings
     vision_positions, time_s = inputs.vision_positions, segment.time_s
     assert vision_positions is not None
+    # 1. Prediction step in which EKF2 fuses each sample
     measurement_times_s = (
         vision_positions.timestamp_s - settings[EV_POS.delay] * 1e-3 - 0.5 * inputs.mean_step_s
     )
@@ -56,6 +57,7 @@ def _group_vision_by_event(
     )
     # EKF2 fuses a late sample when it arrives, after the earlier samples. 1e-9: rounding errors
     step_index = np.maximum.accumulate(np.searchsorted(time_s, earliest_fusion_times_s - 1e-9))
+    # 2. Samples that EKF2 can fuse: inside the segment, and not too late
     is_usable = (
         (step_index > 0)
         & (step_index < len(time_s))
@@ -66,17 +68,21 @@ def _group_vision_by_event(
     # EKF2 fuses only the newer of two samples in one prediction step
     is_usable[:-1] &= step_index[1:] > step_index[:-1]
     step_index = step_index[is_usable]
+    # 3. Position of the IMU: position of the camera minus lever arm
     lever_arm_m = np.array([settings[name] for name in EV_POS.lever_arm]) - inputs.imu_offset_m
-    position_m = (
-        vision_positions.position_m[is_usable] - segment.body_to_ned[step_index] @ lever_arm_m
-    )[:, :2]
-    times_and_variances = (
+    position_m = vision_positions.position_m[is_usable]
+    position_m = position_m - segment.body_to_ned[step_index] @ lever_arm_m
+    variance_north_m2, variance_east_m2, _ = vision_positions.variance_m2[is_usable].T
+    return group_samples_by_event(
+        segment,
+        event_steps,
+        step_index,
+        position_m[:, :2],
+        slice(0, 2),  # axes north and east
         measurement_times_s[is_usable],
         time_s[step_index],
-        *vision_positions.variance_m2[is_usable, :2].T,
-    )
-    return group_samples_by_event(
-        segment, event_steps, step_index, position_m, slice(0, 2), *times_and_variances
+        variance_north_m2,
+        variance_east_m2,
     )
 
 
@@ -96,6 +102,7 @@ class VisionFilter:
     def __init__(self, batch: FilterBatch) -> None:
         segment, parameters = batch.segment, batch.parameters
         is_enabled_by_aid = batch.is_enabled_by_aid
+        # Rows of _group_vision_by_event, each of shape (samples of an event, events, filters)
         samples = stack_samples(
             [
                 _group_vision_by_event(batch, event_steps, configuration)
@@ -104,28 +111,35 @@ class VisionFilter:
                 )
             ]
         )
+        _, _, self.age_s, self.measurement_times_s, self.fusion_time_s, _, _, sample_flags = samples
+        sample_count, event_count, configuration_count = sample_flags.shape
+        # North and east become the last axis, as in the states
         self.position_m = np.moveaxis(samples[:2], 0, -1)
-        self.age_s, self.measurement_times_s, self.fusion_time_s = samples[2:5]
-        _, sample_count, event_count, configuration_count = samples.shape
+        reported_variance_m2 = np.moveaxis(samples[5:7], 0, -1)
         self.update_records = np.full((event_count, sample_count, 7, configuration_count), np.nan)
         self.position_reset_m = np.zeros((event_count, configuration_count, 2))
-        has_sample = (samples[7] > 0.0) & is_enabled_by_aid[EV_POS.name]
+        has_sample = (sample_flags > 0.0) & is_enabled_by_aid[EV_POS.name]
         # Vision samples before the GNSS sample of an event, and vision samples in the same
         # prediction step (age 0), which EKF2 fuses after GNSS
         self.has_sample = [has_sample & (self.age_s > 0.0), has_sample & (self.age_s == 0.0)]
         self.has_gate = batch.has_gate
         self.is_gnss_off = ~is_enabled_by_aid[GNSS_POS.name]
         self.gate_squared = np.maximum(parameters[EV_POS.gate], MIN_INNOVATION_GATE)[:, None] ** 2
-        reported_variance = samples[5:7] * (
-            batch.uses_reported_noise & (parameters[EV_POS.noise_mode_parameter] != 1.0)
+        # R: reported variance, but at least the noise parameter of vision and, while EKF2 fuses
+        # GNSS, that of GNSS
+        uses_reported_noise = batch.uses_reported_noise & (
+            parameters[EV_POS.noise_mode_parameter] != 1.0
         )
-        min_variance = np.maximum(
+        min_variance_m2 = np.maximum(
             np.maximum(parameters[EV_POS.noise], MIN_MEASUREMENT_NOISE_SIGMA) ** 2,
             np.where(self.is_gnss_off, 0.0, parameters[GNSS_POS.noise] ** 2),
         )
-        self.R_m2 = np.moveaxis(np.maximum(reported_variance, min_variance), 0, -1)
+        self.R_m2 = np.maximum(
+            reported_variance_m2 * uses_reported_noise[:, None], min_variance_m2[..., None]
+        )
         bias = np.zeros((configuration_count, 2))
         self.bias = BiasEstimator(bias, bias + np.inf, segment.step_s)
+        # No sample yet: the first sample starts the fusion, as after a gap
         self.last_sample_s, self.last_attempt_s = np.full((2, configuration_count), -np.inf)
         self.last_fusion_s = np.full(configuration_count, segment.time_s[0])
         self.was_gnss_off = self.is_gnss_off[0]
@@ -184,25 +198,26 @@ class VisionFilter:
                 is_bias_updated[:, None],
             )
             S = predicted_variance + R
-            # 2. Decision: fuse, reject or restart
-            has_fusion_restarted = (time_since_sample_s > MAX_SAMPLE_GAP_S) | (
+            # 2. Decision: fuse, reject, or restart. The first sample after a gap, and after a
+            # change of GNSS fusion, restarts the fusion. All others are tested with the gate
+            must_restart = (time_since_sample_s > MAX_SAMPLE_GAP_S) | (
                 is_gnss_off != self.was_gnss_off
             )
-            is_tested = has_sample & ~has_fusion_restarted
+            is_tested = has_sample & ~must_restart
             is_innovation_large = np.any(nu * nu > self.gate_squared * S, axis=1)
             is_outside_gate = is_tested & is_innovation_large & self.has_gate
             is_fused = is_tested & ~is_outside_gate
             is_rejection_timed_out = is_outside_gate & (
                 fusion_time_s - self.last_attempt_s > MAX_REJECTION_DURATION_S
             )
-            is_restarting = has_sample & (has_fusion_restarted | is_rejection_timed_out)
+            is_restarting = (has_sample & must_restart) | is_rejection_timed_out
+            # A restart resets the position if vision is the only position source, or if EKF2 has
+            # fused neither vision nor GNSS for a time. Otherwise, it sets the vision bias
+            is_gnss_timed_out = fusion_time_s - last_gnss_fusion_s > MAX_REJECTION_DURATION_S
             is_position_reset = is_restarting & (
-                is_gnss_off
-                | (
-                    is_rejection_timed_out
-                    & (fusion_time_s - last_gnss_fusion_s > MAX_REJECTION_DURATION_S)
-                )
+                is_gnss_off | (is_rejection_timed_out & is_gnss_timed_out)
             )
+            is_bias_initialised = is_restarting & ~is_position_reset
             # If EKF2 resets its position to a sample, it logs innovation 0
             update_record = (
                 *np.where(is_position_reset, 0.0, nu.T),
@@ -218,6 +233,7 @@ class VisionFilter:
             K *= is_fused[:, None, None]
             x = x + (K @ nu[:, :, None])[:, :, 0]
             P = P - K @ HP
+            # Without GNSS, the bias is zero: the reset is to the uncorrected position
             position_reset_m = np.where(is_gnss_off[:, None], position_innovation_m, nu)
             position_reset_m *= is_position_reset[:, None]
             set_states(
@@ -229,13 +245,12 @@ class VisionFilter:
                 np.where(is_gnss_off[:, None], R_m2, R),
             )
             self.position_reset_m[event] += position_reset_m
-            # 4. Bias, and times of the last sample, attempt and fusion
-            # If the fusion of vision restarts during GNSS fusion, EKF2 sets the vision bias so that
-            # vision agrees with EKF2's position
-            is_bias_initialised = is_restarting & ~is_position_reset
+            # 4. Bias (state minus measurement). If the fusion of vision restarts during GNSS
+            # fusion, EKF2 sets the bias so that vision agrees with EKF2's position
             is_bias_cleared = is_position_reset & is_gnss_off
             self.bias.bias_m[is_bias_initialised] = -position_innovation_m[is_bias_initialised]
             self.bias.bias_m[is_bias_cleared] = self.bias.variance_m2[is_bias_cleared] = 0.0
+            # 5. Times of the last sample, attempt and fusion
             self.last_sample_s[has_sample] = fusion_time_s[has_sample]
             self.last_attempt_s = np.where(
                 is_fused | is_restarting, fusion_time_s, self.last_attempt_s

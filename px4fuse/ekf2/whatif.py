@@ -227,25 +227,10 @@ def what_if(
     """
     if not model.agreement.good:
         return model.agreement.as_unavailable(ANALYSIS_NAME)
-    replays = replay_with_settings(model, settings, disable_time_s_by_aid=disable_time_s_by_aid)
     flight = model.flight
     spans_s = model.baseline_replay.find_evaluated_spans()
     if disable_time_s_by_aid:
-        first_disable_time_s = min(disable_time_s_by_aid.values())
-        replay_end_s = spans_s[-1][1]
-        spans_after_disabling = [
-            (max(start, first_disable_time_s), end)
-            for start, end in spans_s
-            if end - first_disable_time_s > MIN_EVALUATED_DURATION_S
-        ]
-        # Later segments start from logged states, to which the disabled source contributed
-        spans_s = tuple(spans_after_disabling[:1])
-        if not spans_s:
-            raise SettingsError(
-                f"--from {first_disable_time_s:g} s leaves less than "
-                f"{MIN_EVALUATED_DURATION_S:g} s of the replayed flight, which ends at "
-                f"{replay_end_s:.0f} s. Choose an earlier time."
-            )
+        spans_s = _select_first_span_after(min(disable_time_s_by_aid.values()), spans_s)
     summaries: list[Ekf2Statistics] = []
     notes: list[str] = []
     if settings and model.inputs.aid == GNSS_POS:
@@ -253,7 +238,9 @@ def what_if(
             notes.append(HEADING_LOGGED_NOTE)
         if model.inputs.reason_to_use_logged_height:
             notes.append(HEIGHT_LOGGED_NOTE)
-    for replay in replays:
+    for replay in replay_with_settings(
+        model, settings, disable_time_s_by_aid=disable_time_s_by_aid
+    ):
         summaries.append(_summarise_replay(flight, replay, spans_s))
         notes += _describe_replay_limits(model, replay)
         if disable_time_s_by_aid:
@@ -265,6 +252,21 @@ def what_if(
         whatif=_mark_unpredictable_statistics(model, summaries, spans_s, disable_time_s_by_aid),
         evaluated_s=spans_s,
         notes=tuple(notes),
+    )
+
+
+def _select_first_span_after(disable_time_s: float, spans_s: Spans) -> Spans:
+    """Return the part of the first evaluated span after an aiding source is disabled.
+
+    Later spans are omitted: their replay starts from a logged state, to which the disabled source
+    contributed.
+    """
+    for start, end in spans_s:
+        if end - disable_time_s > MIN_EVALUATED_DURATION_S:
+            return ((max(start, disable_time_s), end),)
+    raise SettingsError(
+        f"--from {disable_time_s:g} s leaves less than {MIN_EVALUATED_DURATION_S:g} s of the "
+        f"replayed flight, which ends at {spans_s[-1][1]:.0f} s. Choose an earlier time."
     )
 
 
@@ -294,7 +296,6 @@ def make_sweep_values(
             f"{count} is not a valid number of sweep values. Use 2 to {MAX_SWEEP_VALUES}."
         )
     sweep = np.geomspace(low, high, count) if low > 0 else np.linspace(low, high, count)
-    sweep[[0, -1]] = low, high
     return [float(value) for value in sweep]
 
 
@@ -426,20 +427,24 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf2St
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     evaluated_updates = rows_inside(logged_innovations(ekf2), spans_s)
+    # EKF2 publishes a reset when it happens. The reset sample was measured earlier, by the delay of
+    # the fusion horizon
     fusion_horizon_delay_s = 0.0 if isinstance(ekf2.horizon_s, Unavailable) else ekf2.horizon_s
     reset_times_s = find_horizontal_reset_times_s(ekf2) - fusion_horizon_delay_s
     reset_times_s = reset_times_s[is_inside_spans(reset_times_s, spans_s)]
     replayed_update_count = len(rows_inside(replay.updates, spans_s))
-    longest_gap_s: float | Unavailable = Unavailable(
-        "longest time without fusion",
-        f"the log contains only {len(evaluated_updates)} of about {replayed_update_count} "
-        "innovations",
-        f"Log {ekf2.innovation_topics[0]} at full rate.",
-    )
+    longest_gap_s: float | Unavailable
     if len(evaluated_updates) > MIN_LOGGED_INNOVATION_FRACTION * replayed_update_count:
         fusion_times_s = evaluated_updates.index[evaluated_updates["rejected"] == 0]
         longest_gap_s = _find_longest_gap_s(
             np.concatenate([fusion_times_s, reset_times_s]), spans_s
+        )
+    else:
+        longest_gap_s = Unavailable(
+            "longest time without fusion",
+            f"the log contains only {len(evaluated_updates)} of about {replayed_update_count} "
+            "innovations",
+            f"Log {ekf2.innovation_topics[0]} at full rate.",
         )
     # A flight with a replay has an attitude
     assert isinstance(flight.attitude, pd.DataFrame)
@@ -455,7 +460,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf2St
         spans_s,
         evaluated_updates,
         ekf2.state,
-        None,
+        None,  # σ from the logged position variance
         other_aid_updates,
         headings_rad,
         changed={},
@@ -475,15 +480,25 @@ def _make_summary(
     headings_rad: pd.Series,
     **other_fields: Any,
 ) -> Ekf2Statistics:
-    """Return EKF2's statistics; ``other_fields`` are further fields of :class:`Ekf2Statistics`.
+    """Return EKF2's statistics in the evaluated time, from the log or from a replay.
 
-    Without ``variance``, the logged position variance is used.
+    Parameters
+    ----------
+    evaluated_updates : DataFrame
+        Updates with the position source.
+    published_track : DataFrame
+        Published state.
+    variance : DataFrame or None
+        Position variance; None for the logged variance.
+    other_aid_updates : mapping from PX4's name to DataFrame
+        Updates with the other aiding sources, also outside the evaluated time.
+    headings_rad : Series
+        Heading of EKF2.
+    **other_fields
+        Further fields of :class:`Ekf2Statistics`.
     """
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    # The median reported σ is computed at the times of the logged variances, so that the medians of
-    # replay and log are comparable
-    logged_variance = ekf2.variance
     evaluated_times_s = rows_inside(ekf2.state, spans_s).index.to_numpy()
 
     def compute_rmse_m(direction: Array) -> float | Unavailable:
@@ -493,37 +508,41 @@ def _make_summary(
         rmse_to_truth = compute_rmse_to_truth(flight, position_m, direction, evaluated_times_s)
         return NO_TRUTH if rmse_to_truth is None else rmse_to_truth
 
-    for axis, direction in zip(HORIZONTAL_AXES, np.eye(3), strict=False):
+    def summarise_axis(axis: NedAxis, direction: Array) -> AxisStatistics:
         median_sigma: float | Unavailable
-        if isinstance(logged_variance, Unavailable):
-            median_sigma = logged_variance
+        if isinstance(ekf2.variance, Unavailable):
+            median_sigma = ekf2.variance
         else:
-            variance_times_s = rows_inside(logged_variance, spans_s).index
-            axis_variance = (logged_variance if variance is None else variance)[f"{axis}_m2"]
-            median_sigma = float(
-                np.sqrt(np.median(np.interp(variance_times_s, axis_variance.index, axis_variance)))
-            )
-        other_fields[axis] = AxisStatistics(
+            # At the times of the log, so replay and log have the same number of values
+            times_s = rows_inside(ekf2.variance, spans_s).index
+            table = ekf2.variance if variance is None else variance
+            axis_variance = np.interp(times_s, table.index, table[f"{axis}_m2"])
+            median_sigma = float(np.sqrt(np.median(axis_variance)))
+        return AxisStatistics(
             *_compute_innovation_statistics(evaluated_updates, axis),
             median_sigma,
             compute_rmse_m(direction),
         )
+
+    north_direction, east_direction, down_direction = np.eye(3)
     aids = {
         name: _summarise_aid(evaluated, spans_s)
         for name, updates in other_aid_updates.items()
         if len(evaluated := rows_inside(updates, spans_s))
     }
-    if velocity := aids.pop(GNSS_VEL.name, None):
-        other_fields["velocity_rejected_fraction"] = velocity.rejected_fraction
-    if vision := aids.pop(EV_POS.name, None):
-        other_fields["others"] = {EV_POS.name: vision}
-    if other_aid_updates.keys() & HEIGHT_AID_NAMES:
-        other_fields["heights"] = aids
-        other_fields["height_rmse_to_truth_m"] = compute_rmse_m(np.eye(3)[2])
+    velocity = aids.get(GNSS_VEL.name)
     return Ekf2Statistics(
+        north=summarise_axis("north", north_direction),
+        east=summarise_axis("east", east_direction),
         samples=len(evaluated_updates),
         rejected_fraction=float(evaluated_updates["rejected"].mean()),
         heading_error_mean_deg=_compute_heading_error_deg(flight, replay, headings_rad, spans_s),
+        heights={name: aids[name] for name in aids if name in HEIGHT_AID_NAMES},
+        others={name: aids[name] for name in aids if name == EV_POS.name},
+        height_rmse_to_truth_m=compute_rmse_m(down_direction)
+        if other_aid_updates.keys() & HEIGHT_AID_NAMES
+        else HEIGHT_NOT_REPLAYED,
+        velocity_rejected_fraction=velocity.rejected_fraction if velocity else None,
         **other_fields,
     )
 
@@ -590,17 +609,19 @@ def _describe_deviation(
     aids_text = ", ".join(
         f"{aid} from {from_s:g} s on" for aid, from_s in disable_time_s_by_aid.items()
     )
-    height_aids = HEIGHT_AID_NAMES & model.baseline_replay.other_aid_updates.keys()
-    horizontal_aids = {*list_modelled_aids(model.inputs)} - {MAG.name} - height_aids
+    # All aiding sources except magnetometer and height sensors measure horizontal motion
+    enabled_horizontal_aids = {*list_modelled_aids(model.inputs)}.difference(
+        disable_time_s_by_aid, HEIGHT_AID_NAMES, [MAG.name]
+    )
     largest_distance_time_s = position_difference_m.index[horizontal_distance_m.argmax()]
     note = (
         f"Without {aids_text}, the replayed position differs from the replay with all aiding "
         f"sources by at most {horizontal_distance_m.max():.3g} m (at "
         f"{largest_distance_time_s:.1f} s), and by {horizontal_distance_m[-1]:.3g} m at the end"
     )
-    if height_aids & {*disable_time_s_by_aid}:
+    if HEIGHT_AID_NAMES & disable_time_s_by_aid.keys():
         note += f". The heights of both replays differ by at most {height_difference_m.max():.3g} m"
-    if horizontal_aids <= disable_time_s_by_aid.keys():
+    if not enabled_horizontal_aids:
         note += (
             ". The replay without aiding sources uses only the IMU. EKF2 stops publishing "
             "a position after EKF2_NOAID_TOUT (5 s)"
@@ -609,13 +630,16 @@ def _describe_deviation(
 
 
 def _describe_replay_limits(model: Ekf2Model, replay: Ekf2Replay) -> Iterator[str]:
+    # 1. Effects of the changed parameters
     min_noise_m = replay.settings.get(GNSS_POS.noise, 0.0)
-    if min_noise_m >= replay.changed_parameters.get(EV_POS.noise, np.inf):
+    if EV_POS.noise in replay.changed_parameters and (
+        replay.changed_parameters[EV_POS.noise] <= min_noise_m
+    ):
         yield (
             f"While EKF2 fuses GNSS, the noise of vision positions is at least {GNSS_POS.noise} "
             f"({min_noise_m:g} m)"
         )
-    # If the largest delay parameter sets the fusion horizon (before PX4 v1.15), the parameter
+    # Before PX4 v1.15, the largest delay parameter sets the fusion horizon, and the parameter
     # EKF2_DELAY_MAX does not exist
     is_horizon_set_by_largest_delay = model.inputs.rules.is_horizon_set_by_largest_delay
     delay_ms = max(replay.changed_parameters.get(aid.delay, 0.0) for aid in (EV_POS, GNSS_POS))
@@ -626,6 +650,7 @@ def _describe_replay_limits(model: Ekf2Model, replay: Ekf2Replay) -> Iterator[st
             f"{_format_changes(replay)}: EKF2 increases EKF2_DELAY_MAX from {delay_max_ms:g} to "
             f"{delay_ms:g} ms at its start. Reboot PX4 after the change"
         )
+    # 2. Late samples. Unknown arrival times are infinite
     if delay_ms and np.isinf(model.inputs.received_positions.arrival_s).all():
         yield ("Without logged arrival times, the replay assumes that no position arrives too late")
     if replay.late or replay.lost:

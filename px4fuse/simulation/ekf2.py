@@ -18,7 +18,6 @@ from px4fuse.core.arrays import Array, BoolArray, IntArray, cumulative_sums
 from px4fuse.ekf2.filter_batch import FilterConfiguration
 from px4fuse.ekf2.filter_recursion import (
     HEADING,
-    HORIZONTAL_POSITION,
     HORIZONTAL_POSITION_COLUMNS,
     SegmentRun,
 )
@@ -33,6 +32,7 @@ from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
     GYRO_BIAS,
+    HORIZONTAL_POSITION,
     STATE_COUNT,
     THETA,
     VELOCITY,
@@ -42,6 +42,7 @@ from px4fuse.ekf2.replay_segments import (
     downsample_imu,
     find_sample_steps,
     find_step_ends,
+    make_magnetic_field_samples,
 )
 from px4fuse.flight.ekf2_parameters import (
     BAROMETER,
@@ -167,9 +168,12 @@ def simulate_ekf2(
         if not logged_values[MAG.switch]:  # EKF2 fuses all axes of the magnetic field
             segment = add_magnetic_field_states(
                 segment,
-                magnetometer_times_s,
-                magnetometer.fields["magnetometer_ga"].astype(np.float64),
-                1.0,
+                make_magnetic_field_samples(
+                    segment,
+                    magnetometer_times_s,
+                    magnetometer.fields["magnetometer_ga"].astype(np.float64),
+                    1.0,
+                ),
                 # EKF2 initialises earth field and magnetometer bias on the ground
                 np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)]),
                 np.full(6, MAGNETIC_FIELD_SIGMA_GAUSS**2),

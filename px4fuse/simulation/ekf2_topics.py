@@ -8,13 +8,12 @@ import numpy as np
 
 from px4fuse.core.arrays import Array, Array32, BoolArray, IntArray
 from px4fuse.ekf2.filter_recursion import (
-    HORIZONTAL_POSITION,
     HORIZONTAL_POSITION_COLUMNS,
     VELOCITY_COLUMNS,
     SegmentRun,
 )
 from px4fuse.ekf2.inputs import ReplayInputs
-from px4fuse.ekf2.replay_segments import POSITION
+from px4fuse.ekf2.replay_segments import HORIZONTAL_POSITION, POSITION
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid
 from px4fuse.readers.px4_ekf2 import MAG_3D_FUSION_BIT
 from px4fuse.readers.px4_positions import unproject
