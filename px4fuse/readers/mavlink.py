@@ -171,32 +171,16 @@ def _read_ekf2(recording: Recording, parameters: Mapping[str, float]) -> Ekf2 | 
     notes = [f"the EKF2 state is from the autopilot's {message_name} messages"]
     if autopilot != "PX4":
         notes.append(f"in the results, EKF2 stands for the estimator of {autopilot}")
-    if "reset_counter" in samples and (
-        reset_count := np.count_nonzero(samples["reset_counter"].diff()[1:])
-    ):
-        notes.append(
-            f"EKF2 reset its state {reset_count} times. The state contains a jump at each reset"
-        )
-    variance = samples.reindex(columns=VARIANCE_COLUMNS)
-    variance = variance[(variance > 0.0).all(axis=1)]
-    if variance.empty:
-        message_name = MESSAGE_LAYOUTS["ESTIMATOR_STATUS"].topic
-        variance = _compute_variance_from_accuracy(recording)
-        if len(variance):
+    if "reset_counter" in samples:
+        reset_count = np.count_nonzero(samples["reset_counter"].diff()[1:])
+        if reset_count:
             notes.append(
-                "EKF2's position variances are from ESTIMATOR_STATUS: pos_horiz_accuracy² / 2 "
-                "along each horizontal axis. Velocity variances are not sent"
+                f"EKF2 reset its state {reset_count} times. The state contains a jump at each reset"
             )
-    if len(variance):
-        recording.record_stream("ekf2_variance", message_name)
-    reason_for_missing_variance = Unavailable(
-        "EKF2 variances",
-        "the recording has no ODOMETRY with covariance and no ESTIMATOR_STATUS",
-        remedies.get("variance", remedies["state"]),
-    )
+    variance = _read_ekf2_variance(recording, samples, message_name, notes)
     return Ekf2(
         state=state,
-        variance=variance if len(variance) else reason_for_missing_variance,
+        variance=variance,
         innovations={
             axis: Unavailable(
                 f"EKF2 innovations, {axis}",
@@ -217,6 +201,30 @@ def _read_ekf2(recording: Recording, parameters: Mapping[str, float]) -> Ekf2 | 
         notes=tuple(notes),
         record=ARDUPILOT_REPLAY_UNAVAILABLE if autopilot == "ArduPilot" else RECORD_NOT_LOGGED,
     )
+
+
+def _read_ekf2_variance(
+    recording: Recording, samples: pd.DataFrame, message_name: str, notes: list[str]
+) -> TableOrUnavailable:
+    """Return the variances that were sent with the state, or else those from ESTIMATOR_STATUS."""
+    variance = samples.reindex(columns=VARIANCE_COLUMNS)
+    variance = variance[(variance > 0.0).all(axis=1)]
+    if variance.empty:
+        message_name = "ESTIMATOR_STATUS"
+        variance = _compute_variance_from_accuracy(recording)
+        if variance.empty:
+            remedies = recording.remedies
+            return Unavailable(
+                "EKF2 variances",
+                "the recording has no ODOMETRY with covariance and no ESTIMATOR_STATUS",
+                remedies.get("variance", remedies["state"]),
+            )
+        notes.append(
+            "EKF2's position variances are from ESTIMATOR_STATUS: pos_horiz_accuracy² / 2 "
+            "along each horizontal axis. Velocity variances are not sent"
+        )
+    recording.record_stream("ekf2_variance", message_name)
+    return variance
 
 
 def _compute_variance_from_accuracy(recording: Recording) -> pd.DataFrame:

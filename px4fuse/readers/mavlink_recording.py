@@ -110,15 +110,18 @@ def fit_clock_line(x: Array, y: Array) -> ClockLine:
     slope = _fit_clock_rate(x[rows], y[rows])
     if abs(slope - 1.0) <= MAX_RELATIVE_CLOCK_RATE_DIFFERENCE:
         slope = 1.0
-    # Fit the slope twice, because the slope affects which messages have the least delay
-    for fit_number in range(3):
-        relative_delay_s = y - slope * (x - x0)
-        rows = [
-            interval_rows[np.argmin(relative_delay_s[interval_rows])]
-            for interval_rows in rows_by_interval
-        ]
-        if fit_number < 2 and span_s >= MIN_DRIFT_SPAN_S:
+
+    def select_least_delayed(slope: float) -> tuple[Array, list[int]]:
+        """Return the delay (s, with unknown zero) of each reading, and a row of each interval."""
+        delay_s = y - slope * (x - x0)
+        return delay_s, [rows[np.argmin(delay_s[rows])] for rows in rows_by_interval]
+
+    if span_s >= MIN_DRIFT_SPAN_S:
+        # Fit the slope twice, because the slope affects which readings have the least delay
+        for _ in range(2):
+            relative_delay_s, rows = select_least_delayed(slope)
             slope = _fit_clock_rate(x[rows], relative_delay_s[rows], slope)
+    relative_delay_s, rows = select_least_delayed(slope)
     y0 = float(np.median(relative_delay_s[rows]))
     return ClockLine(x0, y0, slope, robust_std(relative_delay_s), len(x))
 
@@ -224,16 +227,12 @@ class Recording:
             table = table[selected_rows]
         # Copy fields only once, because one hour of IMU data has hundreds of megabytes
         values = np.empty((len(selected_rows), len(layout.columns)))
+        scales = {**GEODETIC_SCALE, **layout.scale}
         for column_index, (column, field_name) in enumerate(layout.columns.items()):
-            array_name, _, element_index_text = field_name.removesuffix("]").partition("[")
-            values[:, column_index] = (
-                table[array_name][:, int(element_index_text)]
-                if element_index_text
-                else table[array_name]
-            )
-            values[:, column_index] *= layout.scale.get(column, GEODETIC_SCALE.get(column, 1.0))
+            values[:, column_index] = _get_field(table, field_name)
+            values[:, column_index] *= scales.get(column, 1.0)
         del table
-        values[~(np.abs(values) < MAX_FIELD_VALUE)] = np.nan
+        values[~(np.abs(values) < MAX_FIELD_VALUE)] = np.nan  # damaged values, and NaN
         index = time_index(boot_times_s[selected_rows] - self.time_origin_s)
         samples = pd.DataFrame(values, index, list(layout.columns), copy=False)
         if "roll" in samples:
@@ -249,14 +248,13 @@ class Recording:
         rows = np.flatnonzero(is_valid)
         time_us = np.rint(boot_times_s[rows] * 1e6).astype(np.int64)
         # A message that is received twice, over two links, does not count as dropped
-        first_row_of_each_time = np.sort(np.unique(time_us, return_index=True)[1])
-        increasing_time_rows = find_longest_increasing_subsequence(time_us[first_row_of_each_time])
-        dropped_count = np.count_nonzero(~is_valid) + (
-            len(first_row_of_each_time) - len(increasing_time_rows)
-        )
+        distinct = np.sort(np.unique(time_us, return_index=True)[1])
+        rows, time_us = rows[distinct], time_us[distinct]
+        increasing = find_longest_increasing_subsequence(time_us)
+        dropped_count = np.count_nonzero(~is_valid) + len(rows) - len(increasing)
         if dropped_count:
             self.dropped_count_by_message[name] = int(dropped_count)
-        return rows[first_row_of_each_time[increasing_time_rows]]
+        return rows[increasing]
 
     def compute_receipt_boot_times_s(self, rows: IntArray) -> Array:
         """Return receive times of frames, converted to the boot clock (s).
@@ -273,11 +271,11 @@ class Recording:
         if "time_boot_ms" in (table.dtype.names or ()):
             return table["time_boot_ms"] * 1e-3
         timestamp_s: Array = table["time_usec"] * 1e-6
-        # time_usec is boot time or UNIX time; both are valid if the origin has the same clock
-        is_boot_time = (timestamp_s > 0.0) & (
-            (timestamp_s < MIN_UNIX_TIME_S) == (self.time_origin_s < MIN_UNIX_TIME_S)
-        )
-        return np.where(is_boot_time, timestamp_s, self.compute_receipt_boot_times_s(rows))
+        # time_usec is boot time or UNIX time. It is usable if the time origin has the same clock
+        is_unix_time = timestamp_s >= MIN_UNIX_TIME_S
+        is_origin_unix_time = self.time_origin_s >= MIN_UNIX_TIME_S
+        is_usable = (timestamp_s > 0.0) & (is_unix_time == is_origin_unix_time)
+        return np.where(is_usable, timestamp_s, self.compute_receipt_boot_times_s(rows))
 
     def record_stream(self, data_kind: str, *messages: str, clock: str = BOOT_CLOCK_TEXT) -> None:
         """Store the origin of a kind of data, such as "imu", for the report.
@@ -285,6 +283,12 @@ class Recording:
         The origin is the names of the MAVLink messages, and the clock of their timestamps.
         """
         self.data_source_by_kind[data_kind] = DataSource(messages, clock, self.frames.name)
+
+
+def _get_field(table: NDArray[Any], name: str) -> NDArray[Any]:
+    """Return a field of a message, or one element of an array, for example ``q[0]``."""
+    array_name, _, element = name.removesuffix("]").partition("[")
+    return table[array_name][:, int(element)] if element else table[array_name]
 
 
 def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
@@ -303,26 +307,28 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
         is_velocity_in_frame = samples["child_frame_id"] == frame_number
         if frame.is_body_frame:
             # A position cannot be in the body frame. The conversion of the velocity needs attitude
-            is_position_in_frame[:] = False
-            is_velocity_in_frame &= has_quaternion
-        elif min(frame.axis_signs) > 0.0:
+            rows = is_velocity_in_frame & has_quaternion
+            if rows.any():
+                rotation = Rotation.from_quat(quaternions[rows], scalar_first=True).as_matrix()
+                for columns, matrix in (
+                    (Columns.VELOCITY, rotation),
+                    # Variances in NED: diagonal of R diag(σ²) Rᵀ with the rotation matrix R
+                    (Columns.VELOCITY_VARIANCE, rotation**2),
+                ):
+                    body_values = samples.loc[rows, columns].to_numpy()
+                    converted_samples.loc[rows, columns] = rotate(matrix, body_values)
+            continue
+        if min(frame.axis_signs) > 0.0:  # NED or FRD
             # Quaternions relative to ENU or FLU are not converted
             rows = is_position_in_frame
             converted_samples.loc[rows, orientation] = samples.loc[rows, orientation]
-        for rows, vector_columns, variance_columns in (
+        for rows, columns, variance_columns in (
             (is_position_in_frame, Columns.POSITION, Columns.POSITION_VARIANCE),
             (is_velocity_in_frame, Columns.VELOCITY, Columns.VELOCITY_VARIANCE),
         ):
-            vectors = (
-                samples.loc[rows, vector_columns].to_numpy()[:, frame.axis_order] * frame.axis_signs
-            )
+            vectors = samples.loc[rows, columns].to_numpy()[:, frame.axis_order]
             variances = samples.loc[rows, variance_columns].to_numpy()[:, frame.axis_order]
-            if frame.is_body_frame and rows.any():
-                rotation = Rotation.from_quat(quaternions[rows], scalar_first=True).as_matrix()
-                vectors = rotate(rotation, vectors)
-                # Variances in NED: diagonal of R diag(σ²) Rᵀ with the rotation matrix R
-                variances = rotate(rotation**2, variances)
-            converted_samples.loc[rows, vector_columns] = vectors
+            converted_samples.loc[rows, columns] = vectors * frame.axis_signs
             converted_samples.loc[rows, variance_columns] = variances
     return converted_samples
 
@@ -349,6 +355,7 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
     """Return the longest part of a recording without a restart of the autopilot."""
     notes: list[str] = []
     rows, boot_times_s = _read_boot_times(frames, address)
+    # Select the longest part between two restarts
     analysed_frame_slice = slice(0, len(frames))
     restart_rows = _find_restarts(boot_times_s)
     if len(restart_rows):
@@ -356,6 +363,7 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
         longest_part = max(parts, key=len)
         longest_part_fraction = len(longest_part) / len(rows)
         rows, boot_times_s = rows[longest_part], boot_times_s[longest_part]
+        # The first and last part also contain the frames before and after all boot times
         analysed_frame_slice = slice(
             0 if longest_part is parts[0] else int(rows[0]),
             len(frames) if longest_part is parts[-1] else int(rows[-1]) + 1,
@@ -365,25 +373,16 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
             f"between two restarts is analysed: {boot_times_s[0]:.1f} s to {boot_times_s[-1]:.1f} "
             f"s after boot ({longest_part_fraction:.0%} of the data)"
         )
+    # Select the valid timestamps
     increasing_time_rows = _remove_stray_timestamps(
         boot_times_s,
         find_longest_increasing_subsequence(np.rint(boot_times_s * 1e6).astype(np.int64)),
     )
     rows, boot_times_s = rows[increasing_time_rows], boot_times_s[increasing_time_rows]
-    # By default, all receive times are zero, and equal to the boot times
-    receive_times_s = np.zeros(len(frames))
-    receive_to_boot_time_fit = ClockLine(0.0, 0.0, 1.0, 0.0, len(rows))
-    if frames.receive_times_us is not None:
-        receive_times_s = (frames.receive_times_us - frames.receive_times_us[0]) * 1e-6
-        if len(rows):
-            receive_to_boot_time_fit = fit_clock_line(boot_times_s, receive_times_s[rows]).inverse()
-    elif len(rows):
-        # A raw stream has no receive times. Use the last boot time before each frame
-        message_count = np.searchsorted(rows, np.arange(len(frames)), side="right")
-        receive_times_s = boot_times_s[np.maximum(message_count - 1, 0)]
-    else:
-        notes.append("no message in the stream contains a time")
-    if not len(boot_times_s):
+    receive_times_s, receive_to_boot_time_fit = _map_receive_times(frames, rows, boot_times_s)
+    if not len(rows):
+        if frames.receive_times_us is None:
+            notes.append("no message in the stream contains a time")
         boot_times_s = np.array([0.0, receive_times_s.max()])
     time_origin_s, end_s = boot_times_s[[0, -1]].tolist()
     return Recording(
@@ -398,6 +397,26 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
         notes=notes,
         restart_count=len(restart_rows) or None,
     )
+
+
+def _map_receive_times(
+    frames: MavlinkFrames, rows: IntArray, boot_times_s: Array
+) -> tuple[Array, ClockLine]:
+    """Return the receive time (s) of each frame, and the conversion to the boot clock.
+
+    ``rows`` are the frames with ``boot_times_s``. A raw stream has no receive times. The last boot
+    time before each frame replaces them.
+    """
+    receive_times_s = np.zeros(len(frames))
+    if frames.receive_times_us is not None:
+        receive_times_s = (frames.receive_times_us - frames.receive_times_us[0]) * 1e-6
+        if len(rows):
+            return receive_times_s, fit_clock_line(boot_times_s, receive_times_s[rows]).inverse()
+    elif len(rows):
+        previous_row = np.searchsorted(rows, np.arange(len(frames)), side="right") - 1
+        receive_times_s = boot_times_s[np.maximum(previous_row, 0)]
+    # Identity
+    return receive_times_s, ClockLine(0.0, 0.0, 1.0, 0.0, len(rows))
 
 
 def _find_restarts(boot_times_s: Array) -> IntArray:
