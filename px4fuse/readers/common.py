@@ -5,7 +5,7 @@ The message fields are defined in ``px4_topics.toml`` and ``mavlink_messages.tom
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
@@ -59,21 +59,21 @@ class MessageLayout:
     is_step_function: bool = False
 
 
+# TOML keys of MessageLayout for tables of columns
+_FIELD_TABLES = ("columns", "optional_columns", "scale")
+
+
 def expand_layouts(toml_tables: Mapping[str, Any]) -> dict[str, MessageLayout]:
     """Convert TOML tables to definitions with one message field per column.
 
     By default, the topic or message is the name of the table.
     """
-    rows = {name: {"topic": name, **row} for name, row in toml_tables.items()}
-    return {
-        name: replace(
-            layout,
-            columns=assign_fields_to_columns(layout.columns),
-            optional_columns=assign_fields_to_columns(layout.optional_columns),
-            scale=assign_fields_to_columns(layout.scale),
-        )
-        for name, layout in msgspec.convert(rows, dict[str, MessageLayout]).items()
+    rows = {
+        name: {"topic": name, **row}
+        | {key: assign_fields_to_columns(row[key]) for key in _FIELD_TABLES if key in row}
+        for name, row in toml_tables.items()
     }
+    return msgspec.convert(rows, dict[str, MessageLayout])
 
 
 def assign_fields_to_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
@@ -214,7 +214,7 @@ def _find_frozen_positions(positions: Array, time_s: Array) -> BoolArray:
     ) / -np.log(repetition_probability)
     min_length = max(MIN_FROZEN_POSITION_COUNT, max_random_run_length)
     is_frozen_run = (run_length >= min_length) & (run_duration_s >= MIN_FROZEN_S)
-    return is_repeated & is_frozen_run.to_numpy()
+    return np.asarray(is_repeated & is_frozen_run)
 
 
 def estimate_quantisation_step(values: Array) -> float:

@@ -211,7 +211,14 @@ def _read_ekf2_variance(
     variance = variance[(variance > 0.0).all(axis=1)]
     if variance.empty:
         message_name = "ESTIMATOR_STATUS"
-        variance = _compute_variance_from_accuracy(recording)
+        accuracy = recording.read(MESSAGE_LAYOUTS[message_name])
+        # Accuracies (1 σ, m). PX4's horizontal accuracy is √(σ_north² + σ_east²)
+        # (get_ekf_lpos_accuracy)
+        variance = accuracy[["horizontal_m", "horizontal_m", "vertical_m"]] ** 2 / [2.0, 2.0, 1.0]
+        variance = variance[(variance > 0.0).all(axis=1)]
+        variance = variance.set_axis(Columns.POSITION_VARIANCE, axis=1).reindex(
+            columns=VARIANCE_COLUMNS
+        )
         if variance.empty:
             remedies = recording.remedies
             return Unavailable(
@@ -225,17 +232,6 @@ def _read_ekf2_variance(
         )
     recording.record_stream("ekf2_variance", message_name)
     return variance
-
-
-def _compute_variance_from_accuracy(recording: Recording) -> pd.DataFrame:
-    """Compute position variances (m²) from the accuracies (1 σ, m) in ESTIMATOR_STATUS.
-
-    PX4's horizontal accuracy is √(σ_north² + σ_east²) (``get_ekf_lpos_accuracy``).
-    """
-    accuracy = recording.read(MESSAGE_LAYOUTS["ESTIMATOR_STATUS"])
-    variance = accuracy[["horizontal_m", "horizontal_m", "vertical_m"]] ** 2 / [2.0, 2.0, 1.0]
-    variance = variance[(variance > 0.0).all(axis=1)].set_axis(Columns.POSITION_VARIANCE, axis=1)
-    return variance.reindex(columns=VARIANCE_COLUMNS)
 
 
 def _read_airborne_spans(recording: Recording) -> Spans | Unavailable:

@@ -103,27 +103,28 @@ def fit_clock_line(x: Array, y: Array) -> ClockLine:
     x, y = x[time_order], y[time_order]
     x0, span_s = float(x[len(x) // 2]), float(x[-1] - x[0])
     interval_count = int(np.clip(span_s / CLOCK_FIT_INTERVAL_S, 1, MAX_CLOCK_FIT_INTERVALS))
-    interval_starts = np.searchsorted(x, np.linspace(x[0], x[-1], interval_count + 1)[1:-1])
-    rows_by_interval = [rows for rows in np.split(np.arange(len(x)), interval_starts) if len(rows)]
-    # First approximation, from any reading of each interval
-    rows = [interval_rows[len(interval_rows) // 2] for interval_rows in rows_by_interval]
+    interval_edges = np.linspace(x[0], x[-1], interval_count + 1)[1:-1]
+    interval_of_row = np.searchsorted(interval_edges, x, side="right")
+    # First approximation, from the middle reading of each interval
+    _, first_rows, row_counts = np.unique(interval_of_row, return_index=True, return_counts=True)
+    rows = first_rows + row_counts // 2
     slope = _fit_clock_rate(x[rows], y[rows])
     if abs(slope - 1.0) <= MAX_RELATIVE_CLOCK_RATE_DIFFERENCE:
         slope = 1.0
 
-    def select_least_delayed(slope: float) -> tuple[Array, list[int]]:
+    def select_least_delayed(slope: float) -> tuple[Array, IntArray]:
         """Return the delay (s, with unknown zero) of each reading, and a row of each interval."""
         delay_s = y - slope * (x - x0)
-        return delay_s, [rows[np.argmin(delay_s[rows])] for rows in rows_by_interval]
+        return delay_s, pd.Series(delay_s).groupby(interval_of_row).idxmin().to_numpy()
 
     if span_s >= MIN_DRIFT_SPAN_S:
         # Fit the slope twice, because the slope affects which readings have the least delay
         for _ in range(2):
-            relative_delay_s, rows = select_least_delayed(slope)
-            slope = _fit_clock_rate(x[rows], relative_delay_s[rows], slope)
-    relative_delay_s, rows = select_least_delayed(slope)
-    y0 = float(np.median(relative_delay_s[rows]))
-    return ClockLine(x0, y0, slope, robust_std(relative_delay_s), len(x))
+            delay_s, rows = select_least_delayed(slope)
+            slope = _fit_clock_rate(x[rows], delay_s[rows], slope)
+    delay_s, rows = select_least_delayed(slope)
+    y0 = float(np.median(delay_s[rows]))
+    return ClockLine(x0, y0, slope, robust_std(delay_s), len(x))
 
 
 def _fit_clock_rate(x: Array, y: Array, added_rate: float = 0.0) -> float:
@@ -229,7 +230,10 @@ class Recording:
         values = np.empty((len(selected_rows), len(layout.columns)))
         scales = {**GEODETIC_SCALE, **layout.scale}
         for column_index, (column, field_name) in enumerate(layout.columns.items()):
-            values[:, column_index] = _get_field(table, field_name)
+            # A field, or one element of an array field, for example "q[0]"
+            array_name, _, element = field_name.removesuffix("]").partition("[")
+            array = table[array_name]
+            values[:, column_index] = array[:, int(element)] if element else array
             values[:, column_index] *= scales.get(column, 1.0)
         del table
         values[~(np.abs(values) < MAX_FIELD_VALUE)] = np.nan  # damaged values, and NaN
@@ -285,12 +289,6 @@ class Recording:
         self.data_source_by_kind[data_kind] = DataSource(messages, clock, self.frames.name)
 
 
-def _get_field(table: NDArray[Any], name: str) -> NDArray[Any]:
-    """Return a field of a message, or one element of an array, for example ``q[0]``."""
-    array_name, _, element = name.removesuffix("]").partition("[")
-    return table[array_name][:, int(element)] if element else table[array_name]
-
-
 def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
     """Convert ODOMETRY samples to NED (or FRD); values in unsupported frames become NaN.
 
@@ -300,8 +298,8 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
     quaternions = samples[Columns.QUATERNION].to_numpy(copy=True)
     has_quaternion = np.linalg.norm(quaternions, axis=1) > MIN_QUATERNION_NORM
     orientation = Columns.QUATERNION + Columns.ROTATION_VARIANCE
-    converted_samples = samples.copy()
-    converted_samples[samples.columns.difference(UNCONVERTED_COLUMNS)] = np.nan
+    # All other columns are NaN at first
+    converted_samples = samples[UNCONVERTED_COLUMNS].reindex(columns=samples.columns)
     for frame_number, frame in CONVERSION_BY_MAV_FRAME.items():
         is_position_in_frame = samples["frame_id"] == frame_number
         is_velocity_in_frame = samples["child_frame_id"] == frame_number

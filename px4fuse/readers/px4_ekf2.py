@@ -449,8 +449,8 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     filtered_velocity = flow_velocity[["forward_m_s", "right_m_s"]]
     previous_part = filtered_velocity.shift().mul(previous_output_weight, axis=0)
     flow = (filtered_velocity - previous_part).div(1.0 - previous_output_weight, axis=0)
-    # 2. Noise variance. The noise is logged in rad/s. The range to the ground, velocity ÷ flow rate of the newest
-    # sample, converts it to m/s
+    # 2. Noise variance: it is logged in (rad/s)². The range to the ground, velocity ÷ flow rate of
+    # the newest sample, converts it to (m/s)²
     newest_velocity = flow_velocity[["newest_forward_m_s", "newest_right_m_s"]]
     flow_rate = flow_velocity[["x_rad_s", "y_rad_s"]]
     squared_range_m2 = (newest_velocity**2).sum(axis=1) / (flow_rate**2).sum(axis=1)

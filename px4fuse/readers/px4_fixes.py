@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, rms
-from px4fuse.flight.model import Columns, Ekf2, Unavailable, time_index
+from px4fuse.flight.model import Columns, Ekf2, Unavailable, rows_between, time_index
 
 from . import px4_topics as px4
 from .common import interpolate_inside_time_span, join_nearest_samples
@@ -57,10 +57,8 @@ def read_unlogged_fixes(
     )
     if not is_in_degrees:
         return pd.DataFrame()
-    is_between_fixes = (fixes.index > logged_fixes.index[0]) & (
-        fixes.index < logged_fixes.index[-1]
-    )
-    return fixes[logged_latitude_deg.isna() & is_between_fixes]
+    is_logged = logged_latitude_deg.notna()
+    return rows_between(fixes[~is_logged], logged_fixes.index[0], logged_fixes.index[-1])
 
 
 def reconstruct_fixes(
@@ -133,7 +131,7 @@ def reconstruct_fixes(
     if (
         len(position_errors_m) < MIN_LOGGED_FIXES
         or reconstructed_fixes.empty
-        or (rms_error_m := rms(position_errors_m)) > MAX_FIX_RECONSTRUCTION_ERROR_M
+        or rms(position_errors_m) > MAX_FIX_RECONSTRUCTION_ERROR_M
     ):
         return empty_result
     for column in ("down_m", *Columns.POSITION_VARIANCE):
@@ -142,7 +140,7 @@ def reconstruct_fixes(
         )
     return reconstructed_fixes, (
         f"{len(reconstructed_fixes)} GNSS fixes are not logged. They are computed as EKF2 position "
-        f"plus innovation, with an RMS error of {rms_error_m:.2f} m along each axis"
+        f"plus innovation, with an RMS error of {rms(position_errors_m):.2f} m along each axis"
     )
 
 

@@ -89,8 +89,8 @@ class _ULogContent(io.BytesIO):
         """
         start = self.position
         if size == HEADER_BYTES:
-            # After an invalid message, pyulog seeks to a later position. The bytes from the header of
-            # the invalid message to this position are damaged
+            # After an invalid message, pyulog seeks to a later position. The bytes from the header
+            # of the invalid message to this position are damaged
             if start != self.read_end_offset:
                 self.skipped_bytes += start - self.header_start_offset
             if self.parser is not None:

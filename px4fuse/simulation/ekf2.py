@@ -43,6 +43,7 @@ from px4fuse.ekf2.replay_segments import (
     find_sample_steps,
     find_step_ends,
 )
+from px4fuse.ekf2.vision import HORIZONTAL_VELOCITY
 from px4fuse.flight.ekf2_parameters import (
     BAROMETER,
     EV_POS,
@@ -66,6 +67,7 @@ from . import sensors
 from .ekf2_topics import (
     VEHICLE_AID_SOURCE_LOG_RATE_HZ,
     Ekf2Output,
+    compute_time_since_last_event_s,
     make_ekf2_topics,
 )
 from .faults import FaultSizes
@@ -154,7 +156,9 @@ def simulate_ekf2(
     ``imu``, ``source`` and ``other_sensors`` contain all samples, also those that are not logged.
     """
     aid = scenario.aid
+    # 1. Prediction steps, and the sensors for height and heading
     segment = _make_segment(scenario, faults, motion, imu)
+    # The log contains float32 values
     logged_values = {name: float(np.float32(value)) for name, value in log_parameters.items()}
     step_s = float(np.median(segment.step_s))
     if other_sensors:
@@ -174,6 +178,7 @@ def simulate_ekf2(
                 np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)]),
                 np.full(6, MAGNETIC_FIELD_SIGMA_GAUSS**2),
             )
+    # 2. Rules for the fusion of the positions, and the fusion horizon
     settings = fill_parameters_with_defaults(logged_values, *_select_fused_aids(scenario))
     rules = GNSS_RULES if aid == GNSS_POS else VISION_RULES
     if not int(log_parameters[aid.switch]) & 1:
@@ -182,6 +187,7 @@ def simulate_ekf2(
         rules = replace(rules, max_sample_interval_to_start_s=0.0)
     # EKF2 delays the fusion by the length of its IMU buffer, in steps (estimator_interface.cpp)
     buffer_length = int(np.ceil(1e3 * settings["EKF2_DELAY_MAX"] / PREDICTION_STEP_US))
+    # 3. Run of the EKF2 model, and its topics
     inputs = ReplayInputs(
         settings=settings,
         segments=(segment,),
@@ -210,12 +216,19 @@ def _add_barometer(
 ) -> ReplaySegment:
     """Add the barometer samples, which are EKF2's only height source outdoors."""
     down_m = sensors.HOME_POSITION[2] - barometer.fields["baro_alt_meter"].astype(float)
+    # No ground effect; each sample represents itself only
     samples = pd.DataFrame(
         {"down_m": down_m, "dead_zone_m": 0.0, "weight": 1.0}, measurement_times_s
     )
     step_indices, is_inside = find_sample_steps(segment, measurement_times_s)
-    name = BAROMETER.name
-    height_samples = HeightSamples((name,), name, np.zeros(2), step_indices, samples[is_inside])
+    # The height reference has no bias, and there is no other height sensor
+    height_samples = HeightSamples(
+        fused_sensors=(BAROMETER.name,),
+        reference=BAROMETER.name,
+        initial_bias_and_variance=np.zeros(2),
+        step_indices=step_indices,
+        samples=samples[is_inside],
+    )
     return replace(segment, height_samples=height_samples)
 
 
@@ -223,6 +236,7 @@ def _make_segment(
     scenario: Scenario, faults: FaultSizes, motion: Motion, imu: Topic
 ) -> ReplaySegment:
     """Return the input of the EKF2 model."""
+    # 1. Sums of the IMU samples in each prediction step
     time_us = sensors.get_time_us(imu)
     interval_s = np.diff(time_us) * 1e-6
     step_end_indices = find_step_ends(
@@ -233,6 +247,7 @@ def _make_segment(
         imu.fields["accelerometer_m_s2"][1:].astype(float) * interval_s[:, None],
         step_end_indices,
     )
+    # 2. Attitude at the start and after each step
     time_s = time_us[np.concatenate([[0], step_end_indices])] * 1e-6
     body_to_ned = motion.compute_body_to_ned(time_s)
     true_quaternions = sensors.to_quaternions(body_to_ned)
@@ -244,7 +259,7 @@ def _make_segment(
     attitude_difference = multiply(true_quaternions, conjugate(integrated_attitude))
     attitude_error_rad = sensors.simulate_attitude_error(scenario, faults, time_s).as_rotvec()
     attitude_error_rad[:, :HEADING] = 0.0  # EKF2 estimates the tilt itself
-    # measured at time 0, where the vehicle still stands
+    # 3. Initial state, from the IMU at time 0, where the vehicle still stands
     specific_force_m_s2, rate_rad_s = sensors.simulate_imu_samples(
         scenario,
         faults,
@@ -341,6 +356,7 @@ def _select_accepted_positions(source: sensors.SimulatedPositions) -> ReceivedPo
 
 
 def _compute_output(inputs: ReplayInputs, model_run: SegmentRun) -> Ekf2Output:
+    """Compute the states at the fusion horizon, and those that the output predictor publishes."""
     segment = model_run.segment
     true_quaternions = sensors.to_quaternions(segment.body_to_ned)
     lag_steps = round(inputs.horizon_s / inputs.mean_step_s)
@@ -348,16 +364,17 @@ def _compute_output(inputs: ReplayInputs, model_run: SegmentRun) -> Ekf2Output:
     reset_steps, reset_sizes_m, has_recent_position_aiding = _hold_position_without_aiding(
         model_run, state
     )
+    # The height is never reset
     reset_m = np.zeros((len(state), 3))
     reset_m[reset_steps, :2] = reset_sizes_m
-    # Attitude error (NED) of the output predictor, which integrates the newest gyro samples. It
-    # subtracts the older gyro bias of the fusion horizon
+    # Attitude error (NED) of the output predictor. 1. It integrates the newest gyro samples, from
+    # which it subtracts the older gyro bias of the fusion horizon
     gyro_bias_rad_s = rotate(segment.body_to_ned[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:])
     attitude_error_increments_rad = (
         -segment.attitude_correction_rad - gyro_bias_rad_s * segment.step_s[:, None]
     )
     gyro_attitude_error_rad = state[0, THETA] + cumulative_sums(attitude_error_increments_rad)
-    # the output predictor then follows the attitude of the fusion horizon, lag_steps later
+    # 2. It then follows the attitude of the fusion horizon, lag_steps later
     attitude_error_rad = gyro_attitude_error_rad + sum_attitude_corrections(
         state[:, THETA] - gyro_attitude_error_rad, lag_steps, inputs.mean_step_s, inputs.horizon_s
     )
@@ -394,21 +411,21 @@ def _hold_position_without_aiding(
     """
     events, time_s = model_run.events[0], model_run.segment.time_s
     aiding_steps = events.end_step[model_run.fused[:, 0] | model_run.reset[:, 0]]
-    time_of_aiding_s = np.zeros(len(time_s))
-    time_of_aiding_s[aiding_steps] = time_s[aiding_steps]
     has_recent_position_aiding = (
-        time_s - np.maximum.accumulate(time_of_aiding_s) <= NO_AID_TIMEOUT_S
+        compute_time_since_last_event_s(time_s, aiding_steps, 0.0) <= NO_AID_TIMEOUT_S
     )
-    # 0 without aiding, so the maximum is the last step with aiding
+    # Hold the position of the last step with recent aiding, at rest. The steps without aiding are
+    # replaced by 0, so that the running maximum is the last step with aiding
     last_step_with_aiding = np.maximum.accumulate(
         np.arange(len(time_s)) * has_recent_position_aiding
     )
     state[:, HORIZONTAL_POSITION] = state[last_step_with_aiding, HORIZONTAL_POSITION]
-    state[~has_recent_position_aiding, VELOCITY.start : VELOCITY.start + 2] = 0.0
+    state[~has_recent_position_aiding, HORIZONTAL_VELOCITY] = 0.0
     reset_events = np.flatnonzero(model_run.reset[:, 0])
     reset_steps = events.end_step[reset_events]
     steps_before_reset = reset_steps - 1
-    # a reset moves the estimated or the held position to the measured position
+    # A reset moves the position to the measured position. Its size is the innovation relative to
+    # the estimated position, or, after a time without aiding, the difference from the held position
     reset_sizes_m = np.where(
         has_recent_position_aiding[steps_before_reset, None],
         model_run.innovation[reset_events, 0, HORIZONTAL_POSITION_COLUMNS],
