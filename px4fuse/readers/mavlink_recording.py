@@ -377,10 +377,22 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
         find_longest_increasing_subsequence(np.rint(boot_times_s * 1e6).astype(np.int64)),
     )
     rows, boot_times_s = rows[increasing_time_rows], boot_times_s[increasing_time_rows]
-    receive_times_s, receive_to_boot_time_fit = _map_receive_times(frames, rows, boot_times_s)
-    if not len(rows):
-        if frames.receive_times_us is None:
-            notes.append("no message in the stream contains a time")
+    # Convert the receive times to boot times. By default, all receive times are zero, and equal to
+    # the boot times
+    receive_times_s = np.zeros(len(frames))
+    receive_to_boot_time_fit = ClockLine(0.0, 0.0, 1.0, 0.0, len(rows))
+    if frames.receive_times_us is not None:
+        receive_times_s = (frames.receive_times_us - frames.receive_times_us[0]) * 1e-6
+        if len(rows):
+            receive_to_boot_time_fit = fit_clock_line(boot_times_s, receive_times_s[rows]).inverse()
+    elif len(rows):
+        # A raw stream has no receive times. Use the last boot time before each frame
+        message_count = np.searchsorted(rows, np.arange(len(frames)), side="right")
+        receive_times_s = boot_times_s[np.maximum(message_count - 1, 0)]
+    else:
+        notes.append("no message in the stream contains a time")
+    # Without boot times, the flight lasts from the first to the last receive time
+    if not len(boot_times_s):
         boot_times_s = np.array([0.0, receive_times_s.max()])
     time_origin_s, end_s = boot_times_s[[0, -1]].tolist()
     return Recording(
@@ -395,26 +407,6 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
         notes=notes,
         restart_count=len(restart_rows) or None,
     )
-
-
-def _map_receive_times(
-    frames: MavlinkFrames, rows: IntArray, boot_times_s: Array
-) -> tuple[Array, ClockLine]:
-    """Return the receive time (s) of each frame, and the conversion to the boot clock.
-
-    ``rows`` are the frames with ``boot_times_s``. A raw stream has no receive times. The last boot
-    time before each frame replaces them.
-    """
-    receive_times_s = np.zeros(len(frames))
-    if frames.receive_times_us is not None:
-        receive_times_s = (frames.receive_times_us - frames.receive_times_us[0]) * 1e-6
-        if len(rows):
-            return receive_times_s, fit_clock_line(boot_times_s, receive_times_s[rows]).inverse()
-    elif len(rows):
-        previous_row = np.searchsorted(rows, np.arange(len(frames)), side="right") - 1
-        receive_times_s = boot_times_s[np.maximum(previous_row, 0)]
-    # Identity
-    return receive_times_s, ClockLine(0.0, 0.0, 1.0, 0.0, len(rows))
 
 
 def _find_restarts(boot_times_s: Array) -> IntArray:

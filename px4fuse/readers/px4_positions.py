@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -288,8 +287,9 @@ def _describe_timestamp_clock(published_us: IntArray, sample_timestamps_us: IntA
 def _read_fused_observation(topics: Topics, is_odometry: bool) -> PositionTrack | Unavailable:
     horizontal = TOPIC_LAYOUTS["estimator_aid_src_ev_pos"]
     vertical = TOPIC_LAYOUTS["estimator_aid_src_ev_hgt"]
-    layouts = (horizontal, vertical)
-    topic_names = tuple(layout.topic for layout in layouts if topics.find_layout(layout))
+    topic_names = tuple(
+        layout.topic for layout in (horizontal, vertical) if topics.find_layout(layout)
+    )
     if horizontal.topic not in topic_names:
         return unavailable_source(FUSED_OBSERVATION_TRACK_NAME)
     return _make_track_from_ekf2_topics(
@@ -464,8 +464,18 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
             f"the log has {len(messages)} {GPS_POSITION_TOPIC}, none with a 3D fix",
             NO_FIX_ACTION,
         )
-    fixes, delay_s, clock = _apply_gnss_delay(fixes, topics.ekf2_parameters)
-    # Add the fixes that the GNSS topic lacks, from EKF2's topics
+    # 1. Times of measurement
+    parameters = topics.ekf2_parameters
+    age_s = fixes["published_s"] - fixes.index
+    has_measurement_times = age_s.max() > MAX_ARRIVAL_TO_PUBLICATION_DELAY_US * 1e-6
+    if GNSS_MODE_PARAMETER in parameters and has_measurement_times:
+        delay_s = 0.0
+        clock = "autopilot boot clock: measurement times from the GNSS driver"
+    else:
+        delay_s = fill_parameters_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
+        fixes = fixes.set_axis(time_index(fixes["published_s"].to_numpy() - delay_s))
+        clock = f"autopilot boot clock: timestamp minus {GNSS_POS.delay} ({1e3 * delay_s:g} ms)"
+    # 2. Add the fixes that the GNSS topic lacks, from EKF2's topics
     unlogged_fixes = read_unlogged_fixes(topics, fixes, ekf2)
     if len(unlogged_fixes):
         fixes = pd.concat([fixes, unlogged_fixes]).sort_index()
@@ -473,7 +483,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         # Copy fields that EKF2's topics do not contain from the previous fix
         fixes = fixes.assign(altitude_m=fixes["altitude_m"].interpolate("index")).ffill()
     samples = convert_gnss_fixes(fixes, _find_local_origin(topics))
-    # Without such topics, compute the missing fixes from EKF2's innovations
+    # 3. Without such topics, compute the missing fixes from EKF2's innovations
     rate_hz = compute_sample_rate_hz(samples)
     notes, is_downsampled = list[str](), rate_hz < MAX_DOWNSAMPLED_HZ
     if is_downsampled:
@@ -508,22 +518,6 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         is_selectable_by_default=has_fused_aid(ekf2),
         invalid_reasons=pd.Series("no fix", time_index(times_without_fix_s), dtype=object),
         **track_fields,
-    )
-
-
-def _apply_gnss_delay(
-    fixes: pd.DataFrame, parameters: Mapping[str, float]
-) -> tuple[pd.DataFrame, float, str]:
-    """Return the fixes with the measurement times that EKF2 assumes, its delay, and the clock."""
-    age_s = fixes["published_s"] - fixes.index
-    has_measurement_times = age_s.max() > MAX_ARRIVAL_TO_PUBLICATION_DELAY_US * 1e-6
-    if GNSS_MODE_PARAMETER in parameters and has_measurement_times:
-        return fixes, 0.0, "autopilot boot clock: measurement times from the GNSS driver"
-    delay_s = fill_parameters_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
-    return (
-        fixes.set_axis(time_index(fixes["published_s"].to_numpy() - delay_s)),
-        delay_s,
-        f"autopilot boot clock: timestamp minus {GNSS_POS.delay} ({1e3 * delay_s:g} ms)",
     )
 
 

@@ -21,8 +21,6 @@ from .recording_table import PositionTable
 
 _BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 _PATH_MESSAGE_TYPE = "nav_msgs/msg/Path"
-# Number of bytes that are read at once, which limits the memory
-HASH_BLOCK_BYTES = 1 << 20
 _FRAME_NED = 1  # VehicleOdometry.POSE_FRAME_NED
 _POSE_COLUMNS = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "sigma_x_m", "sigma_y_m", "sigma_z_m"]
 
@@ -90,8 +88,8 @@ def read_bag(path: Path, topic: str | None) -> tuple[PositionTable, str, int]:
     sha256 = hashlib.sha256()
     for file in files:
         with file.open("rb") as stream:
-            while block := stream.read(HASH_BLOCK_BYTES):
-                sha256.update(block)
+            # Instead of a new hash, use the hash of the files before: one hash of all files
+            hashlib.file_digest(stream, lambda: sha256)
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             return _read_topic(name, reader, topic), sha256.hexdigest(), size_bytes

@@ -373,7 +373,10 @@ def simulate_positions(
 def _apply_source_faults(
     position_m: Array, time_s: Array, scenario: Scenario, faults: FaultSizes, motion: Motion
 ) -> Array:
-    """Apply the faults of the source in their order: low-pass filter, scale, yaw, and jump."""
+    """Apply the faults of the source in their order: low-pass filter, scale, yaw, and jump.
+
+    The array ``position_m`` is changed. Use the returned array only.
+    """
     if faults.smoothed_s:
         decay_factor = np.exp(-1.0 / scenario.source_rate_hz / faults.smoothed_s)
         # with this initial state, the filter starts at the first position
@@ -384,7 +387,7 @@ def _apply_source_faults(
             axis=0,
             zi=decay_factor * position_m[:1],
         )
-    position_m = position_m * (1.0 + faults.scale_percent / 100.0)
+    position_m *= 1.0 + faults.scale_percent / 100.0
     if faults.yaw_deg:
         position_m = Rotation.from_euler("z", faults.yaw_deg, degrees=True).apply(position_m)
     # Without this fault, jump_m is 0. By default, the jump is after two thirds of the flight
