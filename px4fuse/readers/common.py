@@ -133,9 +133,10 @@ def find_spans(flags: pd.Series, duration_s: float) -> Spans:
     """
     changes = flags[flags.ne(flags.shift())]
     # Receive times may jump backward. The running maximum keeps the spans in order
-    start_times_s = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0))
-    end_times_s = np.append(start_times_s, duration_s)[1:]
-    spans = zip(start_times_s.tolist(), end_times_s.tolist(), changes, strict=True)
+    start_times_s = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0)).tolist()
+    end_times_s = [*start_times_s[1:], duration_s]
+    # strict=False: without flags, there is an end but no start
+    spans = zip(start_times_s, end_times_s, changes, strict=False)
     return tuple((start, end) for start, end, is_set in spans if is_set and end > start)
 
 

@@ -142,7 +142,7 @@ def wire_layout(message_id: int) -> np.dtype[Any]:
         if type_code == "c":
             fields.append((name, f"S{length or 1}"))
         else:
-            fields.append((name, f"<{type_code}", (length,)) if length else (name, f"<{type_code}"))
+            fields.append((name, f"<{type_code}", (length,) if length else ()))
     return np.dtype(fields)
 
 

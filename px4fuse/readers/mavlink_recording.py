@@ -124,7 +124,9 @@ def fit_clock_line(x: Array, y: Array) -> ClockLine:
             slope = _fit_clock_rate(x[rows], delay_s[rows], slope)
     delay_s, rows = select_least_delayed(slope)
     y0 = float(np.median(delay_s[rows]))
-    return ClockLine(x0, y0, slope, robust_std(delay_s), len(x))
+    # Robust standard deviation: 1.4826 · median absolute deviation
+    jitter_s = float(1.4826 * np.median(np.abs(delay_s - np.median(delay_s))))
+    return ClockLine(x0, y0, slope, jitter_s, len(x))
 
 
 def _fit_clock_rate(x: Array, y: Array, added_rate: float = 0.0) -> float:
@@ -139,11 +141,6 @@ def _fit_clock_rate(x: Array, y: Array, added_rate: float = 0.0) -> float:
 def is_running_clock(timestamps_s: Array) -> bool:
     """Return True if the timestamps are of a running clock: enough of them are distinct."""
     return len(np.unique(timestamps_s)) >= max(MIN_DISTINCT_TIME_FRACTION * len(timestamps_s), 2)
-
-
-def robust_std(values: Array) -> float:
-    """Estimate the standard deviation as 1.4826 · median absolute deviation."""
-    return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
 @dataclass(eq=False)  # not frozen: the readers add streams and counts
@@ -180,8 +177,8 @@ class Recording:
     def rows_of_all_senders(self, message: str) -> IntArray:
         """Return the indices of the MAVLink frames that contain a message, from all senders."""
         rows = self.frames.rows(message)
-        first, stop = self.analysed_frame_slice.start, self.analysed_frame_slice.stop
-        return np.asarray(rows[(rows >= first) & (rows < stop)])
+        analysed_frames = self.analysed_frame_slice
+        return np.asarray(rows[(rows >= analysed_frames.start) & (rows < analysed_frames.stop)])
 
     def rows(self, message: str, address: MavlinkAddress | None = None) -> IntArray:
         """Return the indices of the frames with a message from ``address`` (default: autopilot)."""

@@ -565,16 +565,13 @@ def read_truth(
             velocity = global_positions.reindex(columns=Columns.VELOCITY)
             return Truth(global_layout.topic, projected_positions.join(velocity), attitude)
         if has_fused_aid(ekf2):
-            # The frames differ by a constant; without common times, it is unknown
-            shifts_m = {
-                column: (
-                    projected_positions[column]
-                    - interpolate_inside_time_span(projected_positions.index, local_samples[column])
-                ).median()
-                for column in Columns.POSITION
-            }
-            shifted_positions = local_samples[Columns.POSITION] + pd.Series(shifts_m).fillna(0.0)
-            local_samples = local_samples.assign(**shifted_positions)
+            local_samples = local_samples.copy()
+            # The frames differ by a constant on each axis; NaN if the topics have no common times
+            for column in Columns.POSITION:
+                shift_m = projected_positions[column] - interpolate_inside_time_span(
+                    projected_positions.index, local_samples[column]
+                )
+                local_samples[column] += np.nan_to_num(shift_m.median())
     if len(local_samples):
         return Truth(local_layout.topic, local_samples, attitude)
     if mocap_truth := find_motion_capture_truth(positions):

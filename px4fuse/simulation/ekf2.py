@@ -221,13 +221,10 @@ def _add_barometer(
         {"down_m": down_m, "dead_zone_m": 0.0, "weight": 1.0}, measurement_times_s
     )
     step_indices, is_inside = find_sample_steps(segment, measurement_times_s)
-    # The height reference has no bias, and there is no other height sensor
+    # The barometer is the only fused height sensor, and the reference, so no sensor has a bias
+    name, bias_and_variance = BAROMETER.name, np.zeros(2)
     height_samples = HeightSamples(
-        fused_sensors=(BAROMETER.name,),
-        reference=BAROMETER.name,
-        initial_bias_and_variance=np.zeros(2),
-        step_indices=step_indices,
-        samples=samples[is_inside],
+        (name,), name, bias_and_variance, step_indices, samples[is_inside]
     )
     return replace(segment, height_samples=height_samples)
 
