@@ -441,7 +441,7 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     interval_s = flow_intervals["interval_us"].median() * 1e-6
     if not interval_s > 0.0 or flow_noise.empty:
         return pd.DataFrame()
-    # 1. Mean flow between two logged outputs y of the low-pass filter, n samples apart:
+    # 1. Mean flow of the n samples between two logged outputs y of the low-pass filter:
     # y_k = (1 - w)^n · y_(k-1) + (1 - (1 - w)^n) · mean, with the weight w of a new sample
     steps_s = flow_velocity.index.to_series().diff()
     sample_count = np.rint(steps_s / interval_s)

@@ -340,7 +340,7 @@ def simulate_positions(
         )[is_logged]
         north_m, east_m, down_m = position_m.T
         latitude_deg, longitude_deg = unproject(north_m, east_m, HOME_POSITION[:2])
-        # PX4's timestamp is that of the arrival, GNSS_DELAY_S after the measurement
+        # The timestamp is GNSS_DELAY_S later than the measurement
         fields = make_timestamps(timestamp_us + round(1e6 * GNSS_DELAY_S)) | {
             "eph": reported_sigma_m,
             "epv": reported_sigma_m * GNSS_SIGMA_FACTORS[2],
