@@ -123,9 +123,11 @@ def read_bytes_limited(
     size_bytes = get_file_size(path, error_type, name)
     content = b""
     if size_bytes <= limit_bytes:
-        # Python reserves as much memory as is requested, so the limit is not requested at once
+        # Python reserves as much memory as is requested, so first the size of the file is
+        # requested, not the limit. One byte more shows that the content is longer: the file is
+        # compressed, growing, or in /proc, where the size is 0. It is then read up to the limit
         content = _read_bytes(path, size_bytes + 1, error_type, name)
-        if len(content) > size_bytes:  # compressed, growing, or in /proc, where the size is 0
+        if len(content) > size_bytes:
             content = _read_bytes(path, limit_bytes + 1, error_type, name)
             size_bytes = len(content)
     if size_bytes > limit_bytes:

@@ -9,7 +9,6 @@ from contextlib import suppress
 from dataclasses import is_dataclass
 from datetime import UTC, datetime
 from decimal import Decimal
-from functools import cache
 from typing import Any
 
 import msgspec
@@ -34,6 +33,13 @@ UNIT_BY_SUFFIX = {
 # Conversion factors to the base unit of each quantity
 _UNIT_FACTORS: Mapping[str, Mapping[str, float]] = _UNIT_TABLES["typed"]
 _NUMBER_WITH_UNIT_PATTERN = re.compile(r"([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*(\S*)", re.IGNORECASE)
+# Control characters except tab and line feed; separators of lines, and direction of text (bidi);
+# surrogates; noncharacters, and the last two code points of each plane; invisible tags
+_UNSAFE_CHARACTER_PATTERN = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff\ufdd0-\ufdef"
+    f"{''.join(chr(plane + 0xFFFE) + chr(plane + 0xFFFF) for plane in range(0, 0x110000, 0x10000))}"
+    "\U000e0000-\U000e007f]"
+)
 FORMULA_START_CHARACTERS = "=+-@"
 # Maximum length (characters) of a table cell; Excel allows 32,767
 MAX_CELL_LENGTH = 32_000
@@ -187,9 +193,7 @@ def clean_text(text: str) -> str:
     >>> clean_text("Zo\u00eb\x1b[2J \u202egnp.exe\ud800")
     'Zoë[2J gnp.exe'
     """
-    return (
-        text if text.isascii() and text.isprintable() else "".join(filter(_is_safe_character, text))
-    )
+    return _UNSAFE_CHARACTER_PATTERN.sub("", text)
 
 
 def shorten_to_line(text: str, max_length: int) -> str:
@@ -201,21 +205,6 @@ def shorten_to_line(text: str, max_length: int) -> str:
     # shorten first: cleaning millions of characters is slow
     line = " ".join(clean_text(text[: 10 * max_length]).split())
     return line if len(line) <= max_length else line[: max_length - 1].rstrip() + "…"
-
-
-@cache
-def _is_safe_character(character: str) -> bool:
-    code_point = ord(character)
-    if character in "\n\t":
-        return True
-    return not (
-        unicodedata.category(character) in {"Cc", "Cs", "Zl", "Zp"}
-        or 0x202A <= code_point <= 0x202E
-        or 0x2066 <= code_point <= 0x2069
-        or 0xE0000 <= code_point <= 0xE007F
-        or 0xFDD0 <= code_point <= 0xFDEF
-        or code_point & 0xFFFE == 0xFFFE
-    )
 
 
 def convert_to_unit(text: str, unit: str) -> float | None:

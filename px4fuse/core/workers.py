@@ -155,6 +155,7 @@ def poll_with_limits(
             if not ready_pipes and remaining_s > 0.0:
                 yield None
             for pipe, worker in list(workers.items()):
+                # 1. The worker process sent a message, or ended
                 if pipe in ready_pipes:
                     is_usable, result = _receive_result(worker)
                     if is_usable and not worker.is_ready:
@@ -162,12 +163,15 @@ def poll_with_limits(
                         worker.is_ready = True
                         worker.send(jobs[worker.job_index], timeout_s)
                         continue
+                # 2. Its start or its job takes too long
                 elif time.monotonic() >= worker.deadline:
                     is_usable = False
                     time_limit_s = timeout_s if worker.is_ready else WORKER_START_TIMEOUT_S
                     result = JobFailure(f"the job exceeded the time limit of {time_limit_s:g} s.")
+                # 3. It is still running
                 else:
                     continue
+                # The job is finished: use the worker process for the next job, or end it
                 outcome = worker.job_index, result
                 worker.finished_count += 1
                 if is_usable and waiting_indices and worker.finished_count < MAX_JOBS_PER_WORKER:
@@ -232,7 +236,6 @@ def _run_and_pickle(function: Callable[[Any], Any], job: Any) -> bytes:
     try:
         return pickle.dumps((True, function(job)), pickle.HIGHEST_PROTOCOL)
     except MemoryError:
-        # end the process: the next job would not have enough memory
         return pickle.dumps((False, JobFailure("the job exceeded the memory limit for one file.")))
     except Exception as error:  # noqa: BLE001 - the failure of a job is its result
         error_prefix = "" if isinstance(error, Px4FuseError) else f"{type(error).__name__}: "

@@ -161,21 +161,18 @@ def fill_parameters_with_defaults(
     """
     # One parameter enables all aiding sources of a sensor, such as GNSS position and velocity
     used_switches = {fused_aid.switch for fused_aid in (aid, *other_aids)}
-    excluded_names = {
-        name
-        for other_aid in (EV_POS, GNSS_POS, GNSS_VEL, MAG, BAROMETER)
-        if other_aid.switch not in used_switches
-        for name in (
-            *other_aid.measurement_parameters,
-            *other_aid.lever_arm,
-            *(MAGNETIC_FIELD_NOISE_PARAMETERS if other_aid == MAG else ()),
-        )
-    }
+    excluded_names: set[str] = set()
+    for other_aid in (EV_POS, GNSS_POS, GNSS_VEL, MAG, BAROMETER):
+        if other_aid.switch not in used_switches:
+            excluded_names.update(other_aid.measurement_parameters, other_aid.lever_arm)
+    if MAG.switch not in used_switches:
+        excluded_names.update(MAGNETIC_FIELD_NOISE_PARAMETERS)
     defaults = {
         name: parameter.default
         for name, parameter in MODEL_PARAMETERS.items()
         if name not in excluded_names
     }
+    # These are parameters of external vision only
     if uses_aid_mask(logged_values) and aid == EV_POS:
         defaults |= DEFAULTS_BEFORE_V1_14
     return {name: float(logged_values.get(name, default)) for name, default in defaults.items()}

@@ -9,7 +9,7 @@ import pandas as pd
 
 from px4fuse.comparison.comparison import project_tracks
 from px4fuse.comparison.flight_events import compute_max_interval_s
-from px4fuse.comparison.model import PreparedComparison
+from px4fuse.comparison.model import FilterTracks, PreparedComparison
 from px4fuse.comparison.preparation import prepare_comparison_inputs, select_source_innovations
 from px4fuse.core.text import capitalise_first_letter, format_utc_time, to_json_types
 from px4fuse.ekf2.aids import evaluate_aids
@@ -157,11 +157,13 @@ def list_log_contents(flight: Flight) -> Inventory:
         notes.append("the log ends in flight and does not contain the landing")
     notes += log.notes
     comparison, segment, missing_position_remedy = None, None, ""
+    # The reason is that for the choice of the position source, or that for which KF cannot run
     try:
         comparison = prepare_comparison_inputs(
             flight, ComparisonRequest(log=log.name), keep_positions_as_sent=True
         )
     except Px4FuseError as error:
+        # Options of the command line instead of arguments of the API, without the file name
         reason = replace_argument_names(error.reason).removeprefix(f"{log.name}: ")
         missing_position_remedy = replace_argument_names(error.remedy)
         if not isinstance(error, MissingDataError):
@@ -324,25 +326,26 @@ def _list_ekf2_and_truth_analyses(
     flight: Flight, comparison: PreparedComparison | None
 ) -> Iterator[AnalysisOption]:
     """Yield the analyses that need EKF2 data or ground truth."""
-    ekf2 = flight.ekf2
-    required_data: tuple[object, ...] = (ekf2, ekf2, ekf2, flight.truth)
     if comparison is not None:
         main_axis, segment = comparison.input_axes[0], comparison.segment
-        tracks, truth = project_tracks(comparison, ekf2, main_axis, segment)
-        required_data = (tracks.state, tracks.variance, tracks.innovations, truth)
-    names_and_sample_texts = (
-        ("EKF2 states", "samples of EKF2's position and velocity"),
-        ("EKF2 variances", "samples of EKF2's position and velocity variances"),
-        ("EKF2 consistency", "EKF2 innovations"),
-        ("error against ground truth", "samples of ground truth"),
-    )
-    for (name, sample_text), data in zip(names_and_sample_texts, required_data, strict=True):
-        if isinstance(data, pd.DataFrame):
-            yield AnalysisOption(name, True, f"from {len(data)} {sample_text}")
-        elif isinstance(data, Unavailable):
+        tracks, truth = project_tracks(comparison, flight.ekf2, main_axis, segment)
+    else:
+        no_source = Unavailable("KF", "the log contains no position source for KF", "")
+        ekf2, truth = (
+            data if isinstance(data, Unavailable) else no_source
+            for data in (flight.ekf2, flight.truth)
+        )
+        tracks = FilterTracks(ekf2, ekf2, ekf2)
+    for name, data, sample_text in (
+        ("EKF2 states", tracks.state, "samples of EKF2's position and velocity"),
+        ("EKF2 variances", tracks.variance, "samples of EKF2's position and velocity variances"),
+        ("EKF2 consistency", tracks.innovations, "EKF2 innovations"),
+        ("error against ground truth", truth, "samples of ground truth"),
+    ):
+        if isinstance(data, Unavailable):
             yield AnalysisOption(name, False, data.reason)
         else:
-            yield AnalysisOption(name, False, "the log contains no position source for KF")
+            yield AnalysisOption(name, True, f"from {len(data)} {sample_text}")
 
 
 def _collect_logging_advice(

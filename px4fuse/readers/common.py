@@ -5,7 +5,7 @@ The message fields are defined in ``px4_topics.toml`` and ``mavlink_messages.tom
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
@@ -59,30 +59,33 @@ class MessageLayout:
     is_step_function: bool = False
 
 
+# TOML keys of MessageLayout for tables of columns
+_FIELD_TABLES = ("columns", "optional_columns", "scale")
+
+
 def expand_layouts(toml_tables: Mapping[str, Any]) -> dict[str, MessageLayout]:
     """Convert TOML tables to definitions with one message field per column.
 
     By default, the topic or message is the name of the table.
     """
-    rows = {name: {"topic": name, **row} for name, row in toml_tables.items()}
-    return {
-        name: replace(
-            layout,
-            columns=assign_fields_to_columns(layout.columns),
-            optional_columns=assign_fields_to_columns(layout.optional_columns),
-            scale=assign_fields_to_columns(layout.scale),
-        )
-        for name, layout in msgspec.convert(rows, dict[str, MessageLayout]).items()
+    rows = {
+        name: {"topic": name, **row}
+        | {key: assign_fields_to_columns(row[key]) for key in _FIELD_TABLES if key in row}
+        for name, row in toml_tables.items()
     }
+    return msgspec.convert(rows, dict[str, MessageLayout])
 
 
 def assign_fields_to_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Return the message field of each DataFrame column.
 
-    The keys of ``fields`` are column names, or names of lists in :class:`Columns` such as POSITION.
-    The values are the names of the fields. A number is the constant value of all columns. With an
-    empty text, each field has the name of its column. ``q[]`` means the first elements of an
-    array, one for each column, and ``covariance[0,6]`` means the elements 0 and 6.
+    A key of ``fields`` contains column names, or the name of a list in :class:`Columns` such as
+    POSITION. Its value is one of
+
+    - field names, one for each column, for example ``x,y,z``
+    - an empty text: the fields have the names of the columns
+    - an array: ``q[]`` for its first elements, ``covariance[0,6]`` for the elements 0 and 6
+    - a number: the value of all columns
 
     Examples
     --------
@@ -103,10 +106,14 @@ def assign_fields_to_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
         if isinstance(field_names, float):
             columns |= dict.fromkeys(column_list, field_names)
             continue
-        column_fields = (field_names or column_names).split(",")
-        if array_match := re.fullmatch(r"([^\[]+)\[([\d,]*)\]", field_names):
-            element_indices = re.findall(r"\d+", array_match[2]) or range(len(column_list))
-            column_fields = [f"{array_match[1]}[{element}]" for element in element_indices]
+        if not field_names:
+            column_fields = column_list
+        elif array_match := re.fullmatch(r"([^\[]+)\[([\d,]*)\]", field_names):
+            array, elements = array_match.groups()
+            element_indices = elements.split(",") if elements else range(len(column_list))
+            column_fields = [f"{array}[{element}]" for element in element_indices]
+        else:
+            column_fields = field_names.split(",")
         columns |= zip(column_list, column_fields, strict=True)
     return columns
 
@@ -125,8 +132,11 @@ def find_spans(flags: pd.Series, duration_s: float) -> Spans:
     Each value of the flag is valid until the next value. Times before 0 are replaced by 0.
     """
     changes = flags[flags.ne(flags.shift())]
+    # Receive times may jump backward. The running maximum keeps the spans in order
     start_times_s = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0)).tolist()
-    spans = zip(start_times_s, [*start_times_s[1:], duration_s], changes, strict=False)
+    end_times_s = [*start_times_s[1:], duration_s]
+    # strict=False: without flags, there is an end but no start
+    spans = zip(start_times_s, end_times_s, changes, strict=False)
     return tuple((start, end) for start, end, is_set in spans if is_set and end > start)
 
 
@@ -173,34 +183,39 @@ def classify_invalid_positions(samples: pd.DataFrame, columns: list[str]) -> "pd
     distance_m = np.fmin(previous_distance_m, next_distance_m)
     reason_by_row[is_zero & (distance_m > MIN_DISTANCE_OF_INVALID_ZERO_POSITION_M)] = "zero"
     valid_rows = np.flatnonzero(reason_by_row == "")
-    if len(valid_rows):
-        offset_from_median_m = values[valid_rows] - np.median(values[valid_rows], axis=0)
-        distance_m = np.linalg.norm(offset_from_median_m, axis=1)
-        is_far_from_median = distance_m > max(
-            MIN_DAMAGED_DISTANCE_M,
-            MIN_DAMAGED_TO_MEDIAN_DISTANCE_RATIO * np.median(distance_m),
-        )
-        reason_by_row.iloc[valid_rows[is_far_from_median]] = "far"
-        valid_rows = valid_rows[~is_far_from_median]
-    if len(valid_rows) < 2:
+    if not len(valid_rows):
         return reason_by_row
-    valid_times_s = time_s[valid_rows]
-    is_repeated = np.all(np.diff(values[valid_rows], axis=0) == 0.0, axis=1)
-    run_starts = np.flatnonzero(np.append(True, ~is_repeated))
-    run_ends = np.append(run_starts[1:], len(valid_rows))
-    # Longest run of equal positions that is likely if the source repeats single positions at random
-    repeated_fraction = np.clip(np.mean(is_repeated), 1e-6, 1.0 - 1e-6)
-    max_random_run_length = np.log(
-        len(valid_rows) / MAX_FALSE_ALARM_PROBABILITY_OF_FROZEN_RUN
-    ) / -np.log(repeated_fraction)
-    run_lengths = run_ends - run_starts
-    is_frozen_run = (run_lengths >= max(MIN_FROZEN_POSITION_COUNT, max_random_run_length)) & (
-        valid_times_s[run_ends - 1] - valid_times_s[run_starts] >= MIN_FROZEN_S
+    offset_from_median_m = values[valid_rows] - np.median(values[valid_rows], axis=0)
+    distance_m = np.linalg.norm(offset_from_median_m, axis=1)
+    is_far_from_median = distance_m > max(
+        MIN_DAMAGED_DISTANCE_M,
+        MIN_DAMAGED_TO_MEDIAN_DISTANCE_RATIO * np.median(distance_m),
     )
-    is_frozen = np.append(False, is_repeated) & np.repeat(is_frozen_run, run_lengths)
-    if np.mean(is_frozen) < MAX_FROZEN_FRACTION:
-        reason_by_row.iloc[valid_rows[is_frozen]] = "held"
+    reason_by_row.iloc[valid_rows[is_far_from_median]] = "far"
+    near_rows = valid_rows[~is_far_from_median]
+    if len(near_rows) > 1:
+        is_frozen = _find_frozen_positions(values[near_rows], time_s[near_rows])
+        if np.mean(is_frozen) < MAX_FROZEN_FRACTION:
+            reason_by_row.iloc[near_rows[is_frozen]] = "held"
     return reason_by_row
+
+
+def _find_frozen_positions(positions: Array, time_s: Array) -> BoolArray:
+    """Return True for each repetition in a long run of equal positions, without its first."""
+    is_repeated = np.append(False, np.all(np.diff(positions, axis=0) == 0.0, axis=1))
+    times_in_run_s = pd.Series(time_s).groupby(np.cumsum(~is_repeated))
+    run_length = times_in_run_s.transform("size")
+    run_duration_s = times_in_run_s.transform("max") - times_in_run_s.transform("min")
+    # A source may repeat single positions at random, with probability p. A run of n repetitions
+    # then has the probability p^n. n is too large if a run in the whole track is improbable:
+    # count · p^n < MAX_FALSE_ALARM_PROBABILITY_OF_FROZEN_RUN
+    repetition_probability = np.clip(np.mean(is_repeated[1:]), 1e-6, 1.0 - 1e-6)
+    max_random_run_length = np.log(
+        len(time_s) / MAX_FALSE_ALARM_PROBABILITY_OF_FROZEN_RUN
+    ) / -np.log(repetition_probability)
+    min_length = max(MIN_FROZEN_POSITION_COUNT, max_random_run_length)
+    is_frozen_run = (run_length >= min_length) & (run_duration_s >= MIN_FROZEN_S)
+    return np.asarray(is_repeated & is_frozen_run)
 
 
 def estimate_quantisation_step(values: Array) -> float:

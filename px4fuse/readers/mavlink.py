@@ -171,32 +171,16 @@ def _read_ekf2(recording: Recording, parameters: Mapping[str, float]) -> Ekf2 | 
     notes = [f"the EKF2 state is from the autopilot's {message_name} messages"]
     if autopilot != "PX4":
         notes.append(f"in the results, EKF2 stands for the estimator of {autopilot}")
-    if "reset_counter" in samples and (
-        reset_count := np.count_nonzero(samples["reset_counter"].diff()[1:])
-    ):
-        notes.append(
-            f"EKF2 reset its state {reset_count} times. The state contains a jump at each reset"
-        )
-    variance = samples.reindex(columns=VARIANCE_COLUMNS)
-    variance = variance[(variance > 0.0).all(axis=1)]
-    if variance.empty:
-        message_name = MESSAGE_LAYOUTS["ESTIMATOR_STATUS"].topic
-        variance = _compute_variance_from_accuracy(recording)
-        if len(variance):
+    if "reset_counter" in samples:
+        reset_count = np.count_nonzero(samples["reset_counter"].diff()[1:])
+        if reset_count:
             notes.append(
-                "EKF2's position variances are from ESTIMATOR_STATUS: pos_horiz_accuracy² / 2 "
-                "along each horizontal axis. Velocity variances are not sent"
+                f"EKF2 reset its state {reset_count} times. The state contains a jump at each reset"
             )
-    if len(variance):
-        recording.record_stream("ekf2_variance", message_name)
-    reason_for_missing_variance = Unavailable(
-        "EKF2 variances",
-        "the recording has no ODOMETRY with covariance and no ESTIMATOR_STATUS",
-        remedies.get("variance", remedies["state"]),
-    )
+    variance = _read_ekf2_variance(recording, samples, message_name, notes)
     return Ekf2(
         state=state,
-        variance=variance if len(variance) else reason_for_missing_variance,
+        variance=variance,
         innovations={
             axis: Unavailable(
                 f"EKF2 innovations, {axis}",
@@ -219,15 +203,35 @@ def _read_ekf2(recording: Recording, parameters: Mapping[str, float]) -> Ekf2 | 
     )
 
 
-def _compute_variance_from_accuracy(recording: Recording) -> pd.DataFrame:
-    """Compute position variances (m²) from the accuracies (1 σ, m) in ESTIMATOR_STATUS.
-
-    PX4's horizontal accuracy is √(σ_north² + σ_east²) (``get_ekf_lpos_accuracy``).
-    """
-    accuracy = recording.read(MESSAGE_LAYOUTS["ESTIMATOR_STATUS"])
-    variance = accuracy[["horizontal_m", "horizontal_m", "vertical_m"]] ** 2 / [2.0, 2.0, 1.0]
-    variance = variance[(variance > 0.0).all(axis=1)].set_axis(Columns.POSITION_VARIANCE, axis=1)
-    return variance.reindex(columns=VARIANCE_COLUMNS)
+def _read_ekf2_variance(
+    recording: Recording, samples: pd.DataFrame, message_name: str, notes: list[str]
+) -> TableOrUnavailable:
+    """Return the variances that were sent with the state, or else those from ESTIMATOR_STATUS."""
+    variance = samples.reindex(columns=VARIANCE_COLUMNS)
+    variance = variance[(variance > 0.0).all(axis=1)]
+    if variance.empty:
+        message_name = "ESTIMATOR_STATUS"
+        accuracy = recording.read(MESSAGE_LAYOUTS[message_name])
+        # Accuracies (1 σ, m). PX4's horizontal accuracy is √(σ_north² + σ_east²)
+        # (get_ekf_lpos_accuracy)
+        variance = accuracy[["horizontal_m", "horizontal_m", "vertical_m"]] ** 2 / [2.0, 2.0, 1.0]
+        variance = variance[(variance > 0.0).all(axis=1)]
+        variance = variance.set_axis(Columns.POSITION_VARIANCE, axis=1).reindex(
+            columns=VARIANCE_COLUMNS
+        )
+        if variance.empty:
+            remedies = recording.remedies
+            return Unavailable(
+                "EKF2 variances",
+                "the recording has no ODOMETRY with covariance and no ESTIMATOR_STATUS",
+                remedies.get("variance", remedies["state"]),
+            )
+        notes.append(
+            "EKF2's position variances are from ESTIMATOR_STATUS: pos_horiz_accuracy² / 2 "
+            "along each horizontal axis. Velocity variances are not sent"
+        )
+    recording.record_stream("ekf2_variance", message_name)
+    return variance
 
 
 def _read_airborne_spans(recording: Recording) -> Spans | Unavailable:

@@ -16,7 +16,7 @@ from fastcrc.crc16 import mcrf4xx  # CRC-16/MCRF4XX is MAVLink's X.25 checksum
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as dialect
 
-from px4fuse.core.arrays import BoolArray, IntArray
+from px4fuse.core.arrays import BoolArray, IntArray, iterate_row_blocks
 from px4fuse.errors import LogError
 
 Int64Array = NDArray[np.int64]
@@ -38,8 +38,6 @@ MAX_FRAME_BYTES = HEADER_BYTES_V2 + 255 + CHECKSUM_BYTES + SIGNATURE_BYTES
 RECEIVE_TIME_BYTES = 8
 # Block size (bytes) of the search for frames, which limits the memory
 BLOCK_BYTES = 1 << 16
-# Number of frames that are decoded at once, which limits the memory
-DECODE_BATCH_SIZE = 1 << 12
 # Minimum fraction of bytes in valid frames; otherwise, the file is not MAVLink
 MIN_VALID_FRAME_FRACTION = 0.01
 # Maximum difference (µs) of a valid receive time from the median, as in pymavlink
@@ -112,18 +110,17 @@ class MavlinkFrames:
         payload_starts = self.payload_offsets[rows]
         payload_lengths = self.payload_lengths[rows]
         for length in np.unique(payload_lengths).tolist():
+            # A longer payload has extension fields that pymavlink does not know
             byte_count = min(length, layout.itemsize)
-            if byte_count:
-                rows_with_length = np.flatnonzero(payload_lengths == length)
-                bytes_by_start_offset = np.lib.stride_tricks.sliding_window_view(
-                    content_bytes, byte_count
-                )
-                # Batches limit the memory, because indexing copies the payloads
-                for batch_start in range(0, len(rows_with_length), DECODE_BATCH_SIZE):
-                    batch_rows = rows_with_length[batch_start : batch_start + DECODE_BATCH_SIZE]
-                    payload[batch_rows, :byte_count] = bytes_by_start_offset[
-                        payload_starts[batch_rows]
-                    ]
+            if not byte_count:
+                continue
+            # Row i of this view contains the bytes from offset i. A view needs no memory
+            bytes_from_offset = np.lib.stride_tricks.sliding_window_view(content_bytes, byte_count)
+            rows_with_length = np.flatnonzero(payload_lengths == length)
+            # Blocks limit the memory, because indexing copies the payloads
+            for block in iterate_row_blocks(len(rows_with_length)):
+                block_rows = rows_with_length[block]
+                payload[block_rows, :byte_count] = bytes_from_offset[payload_starts[block_rows]]
         return payload.view(layout)[:, 0]
 
 
@@ -145,7 +142,7 @@ def wire_layout(message_id: int) -> np.dtype[Any]:
         if type_code == "c":
             fields.append((name, f"S{length or 1}"))
         else:
-            fields.append((name, f"<{type_code}", (length,)) if length else (name, f"<{type_code}"))
+            fields.append((name, f"<{type_code}", (length,) if length else ()))
     return np.dtype(fields)
 
 
@@ -227,14 +224,16 @@ def _remove_nested_frames(frames: Int64Array) -> Int64Array:
     kept_rows = []
     previous_end = 0
     for row, (frame_start, frame_end, _) in enumerate(frames.tolist()):
-        # The next frame begins at the end of the previous frame, or after its own receive time
+        # The next frame begins at the end of the previous frame, or after its own receive time:
+        # frame | receive time | frame | receive time | frame
         expected_frame_starts = previous_end, previous_end + RECEIVE_TIME_BYTES
-        # A frame may also begin after skipped bytes, unless another frame begins at an expected
-        # offset: then its start is accidental, for example inside the receive time of the other
-        # frame
-        if frame_start in expected_frame_starts or (
-            frame_start >= previous_end and all_frame_starts.isdisjoint(expected_frame_starts)
-        ):
+        is_expected = frame_start in expected_frame_starts
+        # If no frame has an expected start, bytes were skipped. Otherwise, this frame is
+        # accidental: it begins inside the previous frame or the receive time of the next frame
+        is_after_skipped_bytes = frame_start >= previous_end and all_frame_starts.isdisjoint(
+            expected_frame_starts
+        )
+        if is_expected or is_after_skipped_bytes:
             kept_rows.append(row)
             previous_end = frame_end
     return frames[kept_rows]
@@ -294,7 +293,9 @@ def _count_bytes_outside_frames(
     gap_starts = np.append(0, end_offsets)
     gap_ends = np.append(start_offsets, len(content))
     is_gap = gap_starts < gap_ends
-    is_gap[-1] = True  # the bytes after the last frame, if any
+    # The last gap, after the last frame, is used even if it is empty: after the loop, offset is the
+    # end of the last frame, with a known or unknown message
+    is_gap[-1] = True
     for gap_start, gap_end in zip(
         gap_starts[is_gap].tolist(), gap_ends[is_gap].tolist(), strict=True
     ):
@@ -305,12 +306,11 @@ def _count_bytes_outside_frames(
             unknown_frame_count += 1
             offset += frame_size_bytes
         byte_count_outside_frames += gap_end - offset
-    bytes_after_last_frame = content[offset:]
-    first_byte = bytes_after_last_frame[receive_time_size_bytes : receive_time_size_bytes + 1]
-    is_last_frame_incomplete = (
-        0 < len(bytes_after_last_frame) < receive_time_size_bytes + MAX_FRAME_BYTES
-        # No first byte if the file ends before or within the bytes of the receive time
-        and first_byte in (b"", bytes([MAGIC_BYTE_V1]), bytes([MAGIC_BYTE_V2]))
+    rest = content[offset:]
+    # No first byte if the file ends before or within the bytes of the receive time
+    rest_of_frame = rest[receive_time_size_bytes:]
+    is_last_frame_incomplete = 0 < len(rest) < receive_time_size_bytes + MAX_FRAME_BYTES and (
+        not rest_of_frame or rest_of_frame[0] in (MAGIC_BYTE_V1, MAGIC_BYTE_V2)
     )
     return unknown_frame_count, byte_count_outside_frames, is_last_frame_incomplete
 

@@ -102,6 +102,7 @@ def _read_track(
     """Read the positions from one sender and message type; None without messages."""
     rows = recording.rows(source.message, sender)
     table = recording.frames.table(source.message, rows)
+    # ODOMETRY may be from several estimators: each of them is one track
     if source.estimator_type is not None:
         has_estimator_type = table["estimator_type"] == source.estimator_type
         rows, table = rows[has_estimator_type], table[has_estimator_type]
@@ -110,6 +111,7 @@ def _read_track(
     track_name = source.track_name
     if len(senders) > 1:
         track_name += f"_{sender[0]}_{sender[1]}"
+    # Use the receive times if the sender's clock is unknown
     boot_times_s = recording.compute_receipt_boot_times_s(rows)
     if clock.sender_to_boot_fit is not None:
         timestamps_s = table[source.timestamp_field] * 1e-6
@@ -125,6 +127,7 @@ def _read_track(
     if source.drops_covariance:
         samples[Columns.POSITION_VARIANCE + Columns.ROTATION_VARIANCE] = np.nan
     orientation = read_orientation(samples)
+    # Describe the clock for the report
     clock_map = clock.description
     clock_text = clock_map.clock
     if clock_map.method != "boot clock":

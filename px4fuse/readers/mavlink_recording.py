@@ -103,25 +103,30 @@ def fit_clock_line(x: Array, y: Array) -> ClockLine:
     x, y = x[time_order], y[time_order]
     x0, span_s = float(x[len(x) // 2]), float(x[-1] - x[0])
     interval_count = int(np.clip(span_s / CLOCK_FIT_INTERVAL_S, 1, MAX_CLOCK_FIT_INTERVALS))
-    interval_starts = np.searchsorted(x, np.linspace(x[0], x[-1], interval_count + 1)[1:-1])
-    rows_by_interval = [rows for rows in np.split(np.arange(len(x)), interval_starts) if len(rows)]
-    # First approximation of the slope, from the middle reading of each interval
-    rows = [interval_rows[len(interval_rows) // 2] for interval_rows in rows_by_interval]
+    interval_edges = np.linspace(x[0], x[-1], interval_count + 1)[1:-1]
+    interval_of_row = np.searchsorted(interval_edges, x, side="right")
+    # First approximation, from the middle reading of each interval
+    _, first_rows, row_counts = np.unique(interval_of_row, return_index=True, return_counts=True)
+    rows = first_rows + row_counts // 2
     slope = _fit_clock_rate(x[rows], y[rows])
     if abs(slope - 1.0) <= MAX_RELATIVE_CLOCK_RATE_DIFFERENCE:
         slope = 1.0
-    # Select the reading with the least delay in each interval, three times. After the first two
-    # selections, fit the slope again, because it affects the relative delays
-    for fit_number in range(3):
-        relative_delay_s = y - slope * (x - x0)
-        rows = [
-            interval_rows[np.argmin(relative_delay_s[interval_rows])]
-            for interval_rows in rows_by_interval
-        ]
-        if fit_number < 2 and span_s >= MIN_DRIFT_SPAN_S:
-            slope = _fit_clock_rate(x[rows], relative_delay_s[rows], slope)
-    y0 = float(np.median(relative_delay_s[rows]))
-    return ClockLine(x0, y0, slope, robust_std(relative_delay_s), len(x))
+
+    def select_least_delayed(slope: float) -> tuple[Array, IntArray]:
+        """Return the delay (s, with unknown zero) of each reading, and a row of each interval."""
+        delay_s = y - slope * (x - x0)
+        return delay_s, pd.Series(delay_s).groupby(interval_of_row).idxmin().to_numpy()
+
+    if span_s >= MIN_DRIFT_SPAN_S:
+        # Fit the slope twice, because the slope affects which readings have the least delay
+        for _ in range(2):
+            delay_s, rows = select_least_delayed(slope)
+            slope = _fit_clock_rate(x[rows], delay_s[rows], slope)
+    delay_s, rows = select_least_delayed(slope)
+    y0 = float(np.median(delay_s[rows]))
+    # Robust standard deviation: 1.4826 · median absolute deviation
+    jitter_s = float(1.4826 * np.median(np.abs(delay_s - np.median(delay_s))))
+    return ClockLine(x0, y0, slope, jitter_s, len(x))
 
 
 def _fit_clock_rate(x: Array, y: Array, added_rate: float = 0.0) -> float:
@@ -136,11 +141,6 @@ def _fit_clock_rate(x: Array, y: Array, added_rate: float = 0.0) -> float:
 def is_running_clock(timestamps_s: Array) -> bool:
     """Return True if the timestamps are of a running clock: enough of them are distinct."""
     return len(np.unique(timestamps_s)) >= max(MIN_DISTINCT_TIME_FRACTION * len(timestamps_s), 2)
-
-
-def robust_std(values: Array) -> float:
-    """Estimate the standard deviation as 1.4826 · median absolute deviation."""
-    return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
 @dataclass(eq=False)  # not frozen: the readers add streams and counts
@@ -177,8 +177,8 @@ class Recording:
     def rows_of_all_senders(self, message: str) -> IntArray:
         """Return the indices of the MAVLink frames that contain a message, from all senders."""
         rows = self.frames.rows(message)
-        first, stop = self.analysed_frame_slice.start, self.analysed_frame_slice.stop
-        return np.asarray(rows[(rows >= first) & (rows < stop)])
+        analysed_frames = self.analysed_frame_slice
+        return np.asarray(rows[(rows >= analysed_frames.start) & (rows < analysed_frames.stop)])
 
     def rows(self, message: str, address: MavlinkAddress | None = None) -> IntArray:
         """Return the indices of the frames with a message from ``address`` (default: autopilot)."""
@@ -225,16 +225,15 @@ class Recording:
             table = table[selected_rows]
         # Copy fields only once, because one hour of IMU data has hundreds of megabytes
         values = np.empty((len(selected_rows), len(layout.columns)))
+        scales = {**GEODETIC_SCALE, **layout.scale}
         for column_index, (column, field_name) in enumerate(layout.columns.items()):
-            array_name, _, element_index_text = field_name.removesuffix("]").partition("[")
-            values[:, column_index] = (
-                table[array_name][:, int(element_index_text)]
-                if element_index_text
-                else table[array_name]
-            )
-            values[:, column_index] *= layout.scale.get(column, GEODETIC_SCALE.get(column, 1.0))
+            # A field, or one element of an array field, for example "q[0]"
+            array_name, _, element = field_name.removesuffix("]").partition("[")
+            array = table[array_name]
+            values[:, column_index] = array[:, int(element)] if element else array
+            values[:, column_index] *= scales.get(column, 1.0)
         del table
-        values[~(np.abs(values) < MAX_FIELD_VALUE)] = np.nan
+        values[~(np.abs(values) < MAX_FIELD_VALUE)] = np.nan  # damaged values, and NaN
         index = time_index(boot_times_s[selected_rows] - self.time_origin_s)
         samples = pd.DataFrame(values, index, list(layout.columns), copy=False)
         if "roll" in samples:
@@ -250,14 +249,13 @@ class Recording:
         rows = np.flatnonzero(is_valid)
         time_us = np.rint(boot_times_s[rows] * 1e6).astype(np.int64)
         # A message that is received twice, over two links, does not count as dropped
-        first_row_of_each_time = np.sort(np.unique(time_us, return_index=True)[1])
-        increasing_time_rows = find_longest_increasing_subsequence(time_us[first_row_of_each_time])
-        dropped_count = np.count_nonzero(~is_valid) + (
-            len(first_row_of_each_time) - len(increasing_time_rows)
-        )
+        distinct = np.sort(np.unique(time_us, return_index=True)[1])
+        rows, time_us = rows[distinct], time_us[distinct]
+        increasing = find_longest_increasing_subsequence(time_us)
+        dropped_count = np.count_nonzero(~is_valid) + len(rows) - len(increasing)
         if dropped_count:
             self.dropped_count_by_message[name] = int(dropped_count)
-        return rows[first_row_of_each_time[increasing_time_rows]]
+        return rows[increasing]
 
     def compute_receipt_boot_times_s(self, rows: IntArray) -> Array:
         """Return receive times of frames, converted to the boot clock (s).
@@ -274,12 +272,11 @@ class Recording:
         if "time_boot_ms" in (table.dtype.names or ()):
             return table["time_boot_ms"] * 1e-3
         timestamp_s: Array = table["time_usec"] * 1e-6
-        # time_usec is time since boot or UNIX time. It is used if it is the same kind of time as
-        # time_origin_s; otherwise, the receive time is used
-        is_boot_time = (timestamp_s > 0.0) & (
-            (timestamp_s < MIN_UNIX_TIME_S) == (self.time_origin_s < MIN_UNIX_TIME_S)
-        )
-        return np.where(is_boot_time, timestamp_s, self.compute_receipt_boot_times_s(rows))
+        # time_usec is boot time or UNIX time. It is usable if the time origin has the same clock
+        is_unix_time = timestamp_s >= MIN_UNIX_TIME_S
+        is_origin_unix_time = self.time_origin_s >= MIN_UNIX_TIME_S
+        is_usable = (timestamp_s > 0.0) & (is_unix_time == is_origin_unix_time)
+        return np.where(is_usable, timestamp_s, self.compute_receipt_boot_times_s(rows))
 
     def record_stream(self, data_kind: str, *messages: str, clock: str = BOOT_CLOCK_TEXT) -> None:
         """Store the origin of a kind of data, such as "imu", for the report.
@@ -298,34 +295,36 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
     quaternions = samples[Columns.QUATERNION].to_numpy(copy=True)
     has_quaternion = np.linalg.norm(quaternions, axis=1) > MIN_QUATERNION_NORM
     orientation = Columns.QUATERNION + Columns.ROTATION_VARIANCE
-    converted_samples = samples.copy()
-    converted_samples[samples.columns.difference(UNCONVERTED_COLUMNS)] = np.nan
+    # All other columns are NaN at first
+    converted_samples = samples[UNCONVERTED_COLUMNS].reindex(columns=samples.columns)
     for frame_number, frame in CONVERSION_BY_MAV_FRAME.items():
         is_position_in_frame = samples["frame_id"] == frame_number
         is_velocity_in_frame = samples["child_frame_id"] == frame_number
         if frame.is_body_frame:
             # A position in the body frame is invalid. The conversion of a velocity needs the
             # attitude
-            is_position_in_frame[:] = False
-            is_velocity_in_frame &= has_quaternion
-        elif min(frame.axis_signs) > 0.0:
+            rows = is_velocity_in_frame & has_quaternion
+            if rows.any():
+                rotation = Rotation.from_quat(quaternions[rows], scalar_first=True).as_matrix()
+                for columns, matrix in (
+                    (Columns.VELOCITY, rotation),
+                    # Variances in NED: diagonal of R diag(σ²) Rᵀ with the rotation matrix R
+                    (Columns.VELOCITY_VARIANCE, rotation**2),
+                ):
+                    body_values = samples.loc[rows, columns].to_numpy()
+                    converted_samples.loc[rows, columns] = rotate(matrix, body_values)
+            continue
+        if min(frame.axis_signs) > 0.0:  # NED or FRD
             # Quaternions relative to ENU or FLU are not converted
             rows = is_position_in_frame
             converted_samples.loc[rows, orientation] = samples.loc[rows, orientation]
-        for rows, vector_columns, variance_columns in (
+        for rows, columns, variance_columns in (
             (is_position_in_frame, Columns.POSITION, Columns.POSITION_VARIANCE),
             (is_velocity_in_frame, Columns.VELOCITY, Columns.VELOCITY_VARIANCE),
         ):
-            vectors = (
-                samples.loc[rows, vector_columns].to_numpy()[:, frame.axis_order] * frame.axis_signs
-            )
+            vectors = samples.loc[rows, columns].to_numpy()[:, frame.axis_order]
             variances = samples.loc[rows, variance_columns].to_numpy()[:, frame.axis_order]
-            if frame.is_body_frame and rows.any():
-                rotation = Rotation.from_quat(quaternions[rows], scalar_first=True).as_matrix()
-                vectors = rotate(rotation, vectors)
-                # Variances in NED: diagonal of R diag(σ²) Rᵀ with the rotation matrix R
-                variances = rotate(rotation**2, variances)
-            converted_samples.loc[rows, vector_columns] = vectors
+            converted_samples.loc[rows, columns] = vectors * frame.axis_signs
             converted_samples.loc[rows, variance_columns] = variances
     return converted_samples
 
@@ -352,6 +351,7 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
     """Return the longest part of a recording without a restart of the autopilot."""
     notes: list[str] = []
     rows, boot_times_s = _read_boot_times(frames, address)
+    # Select the longest part between two restarts
     analysed_frame_slice = slice(0, len(frames))
     restart_rows = _find_restarts(boot_times_s)
     if len(restart_rows):
@@ -359,6 +359,7 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
         longest_part = max(parts, key=len)
         longest_part_fraction = len(longest_part) / len(rows)
         rows, boot_times_s = rows[longest_part], boot_times_s[longest_part]
+        # The first and last part also contain the frames before and after all boot times
         analysed_frame_slice = slice(
             0 if longest_part is parts[0] else int(rows[0]),
             len(frames) if longest_part is parts[-1] else int(rows[-1]) + 1,
@@ -368,6 +369,7 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
             f"between two restarts is analysed: {boot_times_s[0]:.1f} s to {boot_times_s[-1]:.1f} "
             f"s after boot ({longest_part_fraction:.0%} of the data)"
         )
+    # Select the valid timestamps
     increasing_time_rows = _remove_stray_timestamps(
         boot_times_s,
         find_longest_increasing_subsequence(np.rint(boot_times_s * 1e6).astype(np.int64)),
@@ -387,6 +389,7 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
         receive_times_s = boot_times_s[np.maximum(message_count - 1, 0)]
     else:
         notes.append("no message in the stream contains a time")
+    # Without boot times, the flight lasts from the first to the last receive time
     if not len(boot_times_s):
         boot_times_s = np.array([0.0, receive_times_s.max()])
     time_origin_s, end_s = boot_times_s[[0, -1]].tolist()

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from px4fuse.core.arrays import Array, ArrayPair, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.flight.model import ClockConversion, Sender
 
@@ -161,15 +161,27 @@ def map_sender_clocks(recording: Recording) -> dict[MavlinkAddress, SenderClockC
 def _map_sender_clock(
     recording: Recording, sender: MavlinkAddress, boot_to_unix_fit: ClockLine | None
 ) -> SenderClockConversion:
+    """Find the conversion of a sender's clock from its positions and TIMESYNC messages.
+
+    In TIMESYNC, ts1 is the time of the request (clock of the requester). tc1 is the time of the
+    reply (clock of the replier), and 0 in requests.
+    """
     frames = recording.frames
+    # Frames from which the clock is estimated, and their timestamps
     rows, timestamps_s = [], []
     for source in POSITION_MESSAGE_TYPES:
-        rows.append(recording.rows(source.message, sender))
-        timestamps_s.append(frames.table(source.message, rows[-1])[source.timestamp_field] * 1e-6)
+        source_rows = recording.rows(source.message, sender)
+        rows.append(source_rows)
+        messages = frames.table(source.message, source_rows)
+        timestamps_s.append(messages[source.timestamp_field] * 1e-6)
     position_times_s = np.concatenate(timestamps_s)
     median_time_s = np.median(position_times_s)
-    # In TIMESYNC, ts1 is the time of the request (clock of the requester). tc1 is the time of the
-    # reply, and 0 in requests
+
+    def is_sender_time(time_s: Array) -> BoolArray:
+        """Return True for times of the clock that the position timestamps have."""
+        return np.abs(time_s - median_time_s) < MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S
+
+    # TIMESYNC messages of the sender: its requests, and its replies to the autopilot
     timesync_rows = recording.rows("TIMESYNC", sender)
     timesync = frames.table("TIMESYNC", timesync_rows)
     request_times_s, reply_times_s = timesync["ts1"] * 1e-9, timesync["tc1"] * 1e-9
@@ -181,9 +193,7 @@ def _map_sender_clock(
     if is_running_clock(position_times_s):
         # The clock fit also uses TIMESYNC requests of the sender: their delay is small, because the
         # sender reads its clock just before sending
-        is_request = (timesync["tc1"] == 0) & (
-            np.abs(request_times_s - median_time_s) < MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S
-        )
+        is_request = (timesync["tc1"] == 0) & is_sender_time(request_times_s)
         rows.append(timesync_rows[is_request])
         timestamps_s.append(request_times_s[is_request])
     # Replies of the autopilot to this sender: no other sender sent the request to which they reply
@@ -192,9 +202,7 @@ def _map_sender_clock(
     other_requests = other_timesync["ts1"][other_timesync["tc1"] == 0]
     replies = recording.table("TIMESYNC")
     replies = replies[(replies["tc1"] != 0) & ~np.isin(replies["ts1"], other_requests)]
-    replies = replies[
-        np.abs(replies["ts1"] * 1e-9 - median_time_s) < MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S
-    ]
+    replies = replies[is_sender_time(replies["ts1"] * 1e-9)]
     return map_clock_to_boot(
         f"system {sender[0]}, component {sender[1]}",
         np.concatenate(timestamps_s),
@@ -248,59 +256,72 @@ def map_clock_to_boot(
     time_source = "receive time" if has_receive_times else "message order"
     boot_time_at_receipt_s = receive_to_boot_time_fit.at(receive_times_s)
     if not is_running_clock(timestamps_s):
-        distinct_count = len(np.unique(timestamps_s))
-        note = (
-            f"the {len(timestamps_s)} timestamps have only {distinct_count} distinct values, so "
-            f"px4fuse uses the {time_source}"
-        )
-        # Jitter of the receive time, if the sender sends at regular intervals
-        intervals_s = np.diff(receive_times_s)
-        intervals_s = intervals_s[intervals_s < MAX_REGULAR_SAMPLE_INTERVAL_S]
-        jitter_s = float(np.std(intervals_s) / np.sqrt(2.0)) if len(intervals_s) else 0.0
-        return SenderClockConversion(
-            None,
-            ClockConversion(
-                name, time_source, len(timestamps_s), 0.0, 0.0, jitter_s, note, distinct_count
-            ),
-        )
+        return _describe_stopped_clock(name, time_source, timestamps_s, receive_times_s)
 
     def compute_difference_from_receipt_s(line: ClockLine) -> float:
         return abs(float(np.median(boot_time_at_receipt_s - line.at(timestamps_s))))
+
+    def agrees_with_receipt(line: ClockLine) -> bool:
+        """Return False for timestamps of another clock than that of the conversion."""
+        return compute_difference_from_receipt_s(line) <= MAX_BOOT_TIME_DIFFERENCE_S
 
     clock_kind = "UNIX time" if np.median(timestamps_s) > MIN_UNIX_TIME_S else "clock"
     clock_name = f"{clock_kind} of {name}"
     timesync_fit = _fit_timesync(sender_timesync_replies, autopilot_timesync_replies)
     identity = ClockLine(0.0, 0.0, 1.0, 0.0, len(timestamps_s))
-    candidates = []
     # A sender clock that started only seconds after the autopilot resembles the boot clock. If
     # TIMESYNC is available, it shows the difference
-    if timesync_fit is None or (
+    is_boot_clock = timesync_fit is None or (
         compute_difference_from_receipt_s(identity)
         - compute_difference_from_receipt_s(timesync_fit)
         < MIN_CLOCK_DIFFERENCE_REDUCTION_BY_TIMESYNC_S
-    ):
+    )
+    if is_boot_clock and agrees_with_receipt(identity):
         note = "the timestamps of the sender are times since the autopilot's boot"
-        candidates.append((name, "boot clock", identity, note))
-    if timesync_fit is not None:
-        candidates.append((clock_name, "TIMESYNC", timesync_fit, ""))
+        return _make_clock_mapping(name, "boot clock", identity, timestamps_s, note)
+    if timesync_fit is not None and agrees_with_receipt(timesync_fit):
+        return _make_clock_mapping(clock_name, "TIMESYNC", timesync_fit, timestamps_s, "")
     if clock_kind == "UNIX time" and boot_to_unix_fit is not None:
-        note = "assumption: the UNIX clocks of sender and autopilot are synchronised"
-        candidates.append((clock_name, "SYSTEM_TIME", boot_to_unix_fit.inverse(), note))
-    for clock, method, line, note in candidates:
-        # Converted timestamps that disagree with the receive times are from another clock
-        if compute_difference_from_receipt_s(line) <= MAX_BOOT_TIME_DIFFERENCE_S:
-            return _make_clock_mapping(clock, method, line, timestamps_s, note)
-    sender_to_boot_fit = fit_clock_line(timestamps_s, receive_times_s)
+        unix_to_boot_fit = boot_to_unix_fit.inverse()
+        if agrees_with_receipt(unix_to_boot_fit):
+            note = "assumption: the UNIX clocks of sender and autopilot are synchronised"
+            return _make_clock_mapping(
+                clock_name, "SYSTEM_TIME", unix_to_boot_fit, timestamps_s, note
+            )
+    # Chain of two lines: sender's clock to receive time, and receive time to boot clock
+    sender_to_receive_fit = fit_clock_line(timestamps_s, receive_times_s)
     sender_to_boot_fit = replace(
-        sender_to_boot_fit,
-        y0=float(receive_to_boot_time_fit.at(sender_to_boot_fit.y0)),
-        slope=sender_to_boot_fit.slope * receive_to_boot_time_fit.slope,
+        sender_to_receive_fit,
+        y0=float(receive_to_boot_time_fit.at(sender_to_receive_fit.y0)),
+        slope=sender_to_receive_fit.slope * receive_to_boot_time_fit.slope,
     )
     note = (
         "the recording has no usable TIMESYNC or SYSTEM_TIME. All sample times are late by the "
         "minimum delay of the link, which is unknown"
     )
     return _make_clock_mapping(clock_name, time_source, sender_to_boot_fit, timestamps_s, note)
+
+
+def _describe_stopped_clock(
+    name: str, time_source: str, timestamps_s: Array, receive_times_s: Array
+) -> SenderClockConversion:
+    """Describe a clock with too few distinct timestamps, which the receive times replace."""
+    distinct_count = len(np.unique(timestamps_s))
+    note = (
+        f"the {len(timestamps_s)} timestamps have only {distinct_count} distinct values, so "
+        f"px4fuse uses the {time_source}"
+    )
+    # Jitter of the receive time, if the sender sends at regular intervals: an interval is the
+    # difference of two receive times, so its standard deviation is √2 times the jitter
+    intervals_s = np.diff(receive_times_s)
+    intervals_s = intervals_s[intervals_s < MAX_REGULAR_SAMPLE_INTERVAL_S]
+    jitter_s = float(np.std(intervals_s) / np.sqrt(2.0)) if len(intervals_s) else 0.0
+    return SenderClockConversion(
+        None,
+        ClockConversion(
+            name, time_source, len(timestamps_s), 0.0, 0.0, jitter_s, note, distinct_count
+        ),
+    )
 
 
 def _fit_timesync(
@@ -390,10 +411,11 @@ def _estimate_lost_fraction(frames: MavlinkFrames, address: MavlinkAddress) -> f
     Return None if the sequence numbers are not usable.
     """
     sequence_numbers = frames.sequence_numbers[frames.is_sent_by(address)].astype(np.int64)
-    sequence_steps = np.mod(np.diff(sequence_numbers) + MAX_LATE_MESSAGES, 256) - MAX_LATE_MESSAGES
+    # The numbers restart after 255. Steps are between -16 (a late message) and 239
+    sequence_steps = (np.diff(sequence_numbers) + MAX_LATE_MESSAGES) % 256 - MAX_LATE_MESSAGES
+    if len(sequence_steps) and not sequence_steps.any():  # the sender does not count its messages
+        return None
     unwrapped_sequence_numbers = np.append(0, np.cumsum(sequence_steps))
     sent_count = np.ptp(unwrapped_sequence_numbers) + 1
     lost_fraction = float(1.0 - len(np.unique(unwrapped_sequence_numbers)) / sent_count)
-    has_sequence_numbers = len(unwrapped_sequence_numbers) == 1 or unwrapped_sequence_numbers.any()
-    is_usable = has_sequence_numbers and lost_fraction < MAX_LOST_MESSAGE_FRACTION
-    return lost_fraction if is_usable else None
+    return lost_fraction if lost_fraction < MAX_LOST_MESSAGE_FRACTION else None

@@ -151,7 +151,7 @@ def read_position_file(
     sigma_columns = find_sigma_columns(column_meanings, frame)
     position_columns = [index for index in axis_columns if index is not None]
 
-    # Select the rows with a time and a position. pandas reads numbers such as 1e999 as infinite
+    # 1. Select the rows with a time and a position. pandas reads numbers such as 1e999 as infinite
     has_time = np.isfinite(numbers[time_column])
     has_position = (numbers[position_columns].abs() < MAX_COORDINATE_IN_FILE_UNIT).all(axis=1)
     dropped_rows = numbers.index[~(has_time & has_position)]
@@ -163,7 +163,7 @@ def read_position_file(
     times_without_position = numbers.loc[has_time & ~has_position, time_column].to_numpy()
     numbers = numbers[has_time & has_position]
 
-    # Convert the times to seconds, and select the rows with increasing times
+    # 2. Convert the times to seconds, and select the rows with increasing times
     plausible_intervals_s = TRAJECTORY_INTERVALS_S if is_trajectory else UWB_INTERVALS_S
     unit, unit_reason = _choose_time_unit(
         numbers[time_column],
@@ -192,7 +192,7 @@ def read_position_file(
     is_unix_time = MIN_VALID_UNIX_TIME_S <= np.median(numbers.index) < MAX_VALID_UNIX_TIME_S
     clock_kind: Literal["UNIX", "local"] = "UNIX" if has_time_zone and is_unix_time else "local"
 
-    # Convert the positions and σ to metres, and remove invalid values
+    # 3. Convert the positions and σ to metres, and remove invalid values
     metres_per_unit, length_unit_text = _choose_length_units(
         numbers[position_columns],
         position_columns,
@@ -296,10 +296,9 @@ def _check_options(
     ):
         if value is not None and value not in units:
             raise SettingsError(f"`{name}`: {value!r} is not one of {', '.join(units)}.")
-    names = columns or ("1", "2", "3")
-    if "" in names or not 3 <= len({*names}) == len(names) <= 5:
+    if columns and ("" in columns or len({*columns}) < len(columns) or not 3 <= len(columns) <= 5):
         raise SettingsError(
-            f"{COLUMNS_OPTION}[,SIGMA]: {','.join(names)!r} does not name three to five different "
+            f"{COLUMNS_OPTION}[,SIGMA]: {','.join(columns)!r} does not name three to five different "
             "columns."
         )
 
@@ -400,28 +399,21 @@ def _interpret_given_columns(
     given_columns = _find_column_indices(table, given_column_names)
     time_column, *position_columns = given_columns[:4]
     sigma_columns = given_columns[4:]
+    # Other columns have no meaning, except UWB tags and, unless given, σ
     kept_kinds = ("tag",) if sigma_columns else ("tag", "sigma")
-    # The names of other columns must not define the frame
-    named_position = find_position_columns(
-        [
-            meaning if index in position_columns else ColumnMeaning()
-            for index, meaning in enumerate(column_meanings)
-        ]
-    )
-    has_axis_names = named_position is not None and {*position_columns} <= {*named_position[1]}
-    meanings = []
-    for index, meaning in enumerate(column_meanings):
-        used_meaning = ColumnMeaning()
-        if index == time_column:
-            used_meaning = ColumnMeaning("time", unit=meaning.unit, time_kind="time")
-        elif index in sigma_columns:
-            used_meaning = ColumnMeaning("sigma", unit=meaning.unit)
-        elif index in position_columns and not has_axis_names:
-            axis = "xyz"[position_columns.index(index)]
-            used_meaning = ColumnMeaning("position", axis, meaning.unit)
-        elif index in position_columns or meaning.kind in kept_kinds:
-            used_meaning = meaning
-        meanings.append(used_meaning)
+    meanings = [
+        meaning if index in position_columns or meaning.kind in kept_kinds else ColumnMeaning()
+        for index, meaning in enumerate(column_meanings)
+    ]
+    frame_and_axis_columns = find_position_columns(meanings)
+    named_axis_columns = frame_and_axis_columns[1] if frame_and_axis_columns else ()
+    if not {*position_columns} <= {*named_axis_columns}:
+        for axis, index in zip("xyz", position_columns, strict=False):  # z may be missing
+            meanings[index] = ColumnMeaning("position", axis, column_meanings[index].unit)
+    time_unit = column_meanings[time_column].unit
+    meanings[time_column] = ColumnMeaning("time", unit=time_unit, time_kind="time")
+    for index in sigma_columns:
+        meanings[index] = ColumnMeaning("sigma", unit=column_meanings[index].unit)
     return meanings
 
 
@@ -445,6 +437,7 @@ def _detect_time_column(
     The time of measurement is preferred to the time of recording. If the time column contains whole
     seconds, the nanoseconds of another column are added to it in ``numeric_table``.
     """
+    # Best time column: not mostly empty, then the best kind of time, then not the nanoseconds
     time_columns = [index for index, column in enumerate(column_meanings) if column.kind == "time"]
     is_mostly_empty = numeric_table[time_columns].fillna(0.0).eq(0.0).mean() >= 0.5
     time_column, *other_time_columns = sorted(
@@ -456,15 +449,17 @@ def _detect_time_column(
         ),
     )
     time_text = table.format_labels(time_column)
-    for index in [*other_time_columns]:
-        if (
-            column_meanings[index].unit == "ns"
-            and (numeric_table[time_column] % 1.0 == 0.0).mean() > MIN_MATCHING_ROW_FRACTION
-            and numeric_table[index].max() < 1e9
-        ):
-            numeric_table[time_column] += numeric_table[index] * 1e-9
-            other_time_columns.remove(index)
-            time_text += f" plus {table.format_labels(index)}"
+    is_whole_second = numeric_table[time_column] % 1.0 == 0.0
+    nanosecond_columns = [
+        index
+        for index in other_time_columns
+        if column_meanings[index].unit == "ns" and numeric_table[index].max() < 1e9
+    ]
+    if nanosecond_columns and is_whole_second.mean() > MIN_MATCHING_ROW_FRACTION:
+        index = nanosecond_columns[0]
+        numeric_table[time_column] += numeric_table[index] * 1e-9
+        other_time_columns.remove(index)
+        time_text += f" plus {table.format_labels(index)}"
     if other_time_columns:
         unused_labels = table.format_labels(*other_time_columns)
         time_text += f" ({column_meanings[time_column].time_kind}; not used: {unused_labels})"
@@ -487,20 +482,19 @@ def _choose_time_unit(
     if given_unit is not None:
         return given_unit, "the unit was given with --position-time-unit"
     median_time, time_steps = times.median(), times.diff()
-    unit_s = SECONDS_BY_TIME_UNIT.get(unit_in_column_name)
-    if unit_s is not None and abs(median_time) * unit_s < MAX_VALID_UNIX_TIME_S:
+    named_unit_s = SECONDS_BY_TIME_UNIT.get(unit_in_column_name)
+    if named_unit_s is not None and abs(median_time) * named_unit_s < MAX_VALID_UNIX_TIME_S:
         return unit_in_column_name, "from the column name"
     median_step = time_steps[time_steps > 0.0].median()
-    plausible_units = []
     for unit, unit_s in SECONDS_BY_TIME_UNIT.items():
         is_unix = MIN_VALID_UNIX_TIME_S <= median_time * unit_s < MAX_VALID_UNIX_TIME_S
-        interval_s = median_step * unit_s
-        if is_unix and interval_s <= MAX_MEDIAN_UNIX_TIMESTAMP_INTERVAL_S:
+        if is_unix and median_step * unit_s <= MAX_MEDIAN_UNIX_TIMESTAMP_INTERVAL_S:
             return unit, f"in {unit}, the timestamps are UNIX times between 2000 and 2100"
-        if unit in plausible_intervals_s:
-            min_interval_s, max_interval_s = plausible_intervals_s[unit]
-            if min_interval_s <= interval_s <= max_interval_s:
-                plausible_units.append(unit)
+    plausible_units = [
+        unit
+        for unit, (min_interval_s, max_interval_s) in plausible_intervals_s.items()
+        if min_interval_s <= median_step * SECONDS_BY_TIME_UNIT[unit] <= max_interval_s
+    ]
     if not plausible_units:
         return "s", (
             "px4fuse assumes seconds, because no unit gives a plausible UWB rate; set another unit "
@@ -525,19 +519,18 @@ def _choose_length_units(
 
     Without a unit in the column names, positions with a very large extent are in mm.
     """
-    named_units = [meaning.unit for meaning in column_meanings]
     named_position_units = [
-        named_units[index]
+        column_meanings[index].unit
         for index in position_columns
-        if named_units[index] in METRES_BY_LENGTH_UNIT
+        if column_meanings[index].unit in METRES_BY_LENGTH_UNIT
     ]
-    # The range from 5 % to 95 % excludes outliers
+    # Extents in the unit of the file. The range from 5 % to 95 % excludes outliers
     extents = positions.quantile(0.95) - positions.quantile(0.05)
     largest_extent = extents.max()
+    # Unit of the columns whose names contain no unit
     default_unit = "m"
     reason = "px4fuse assumes metres, because the column names contain no unit"
     if given_unit is not None:
-        named_units = [given_unit] * len(named_units)
         reason = "the unit was given with --position-unit"
     elif named_position_units:
         default_unit = named_position_units[0]
@@ -548,7 +541,10 @@ def _choose_length_units(
             f"an extent of {largest_extent:.0f} m is too large for an indoor flight; if the unit "
             "is cm, give --position-unit"
         )
-    units = [unit if unit in METRES_BY_LENGTH_UNIT else default_unit for unit in named_units]
+    units = [
+        given_unit or (meaning.unit if meaning.unit in METRES_BY_LENGTH_UNIT else default_unit)
+        for meaning in column_meanings
+    ]
     metres_per_unit = [METRES_BY_LENGTH_UNIT[unit] for unit in units]
     extent_m = max(extents[index] * metres_per_unit[index] for index in position_columns)
     units_text = ", ".join(dict.fromkeys(units[index] for index in position_columns))

@@ -73,14 +73,16 @@ def read_column_name(name: str) -> ColumnMeaning:
     snake_case_name = unicodedata.normalize("NFKC", name).replace("μ", "u")
     snake_case_name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", snake_case_name).lower()
     words = re.findall(r"[^\W_]+", snake_case_name) or [""]
+    # 1. Unit: the last word, for example "m" in "pos_x_m"
     unit = _UNIT_BY_WORD.get(words[-1], "")
-    if unit and len(words) > 1:
-        words.pop()
-    elif unit in SECONDS_BY_TIME_UNIT and len(words[0]) > 2:
-        # a unit alone, such as "sec", is a time
-        return ColumnMeaning("time", unit=unit, time_kind="time")
-    else:
+    if len(words) == 1:
+        # A unit alone, such as "sec", is a time. A letter alone, such as "s", is not a unit
+        if unit in SECONDS_BY_TIME_UNIT and len(words[0]) > 2:
+            return ColumnMeaning("time", unit=unit, time_kind="time")
         unit = ""
+    elif unit:
+        words.pop()
+    # 2. Time and tag: all words must be known
     word_set = {*words}
     is_time = bool(word_set & _WORDS_BY_ROLE["time"]) and word_set <= _TIME_WORDS
     if is_time and unit not in METRES_BY_LENGTH_UNIT:
@@ -92,8 +94,8 @@ def read_column_name(name: str) -> ColumnMeaning:
         return ColumnMeaning("time", unit=unit, time_kind=time_kind)
     if word_set <= _WORDS_BY_ROLE["tag"]:
         return ColumnMeaning("tag")
+    # 3. Position or σ, and axis. Split words such as "px" into position and axis
     sigma_and_context_words = _WORDS_BY_ROLE["sigma"] | _WORDS_BY_ROLE["context"]
-    # Split words such as "px" into position and axis
     split_words: list[str] = []
     for word in words:
         match = _NAME_WITHOUT_SEPARATOR_PATTERN.fullmatch(word)
@@ -152,6 +154,8 @@ def find_sigma_columns(
         if meaning.kind == "sigma":
             sigma_columns.setdefault(meaning.axis, index)
     axes = next(axes for name, axes in _AXIS_NAMES_BY_FRAME if name == frame)
+    # The name contains the axis of the frame ("sigma_north"), the letter ("sigma_x"), or, for one
+    # σ of all axes, no axis ("sigma")
     return tuple(
         sigma_columns.get(axis, sigma_columns.get(letter, sigma_columns.get("")))
         for axis, letter in zip(axes, "xyz", strict=True)

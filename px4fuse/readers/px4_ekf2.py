@@ -111,15 +111,16 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     fusion_flags = _read_fusion_flags(topics, aid_enabled_flags)
     vision_gate = fill_parameters_with_defaults(parameters)[EV_POS.gate]
     aids = read_aids(topics, aid_enabled_flags)
+    notes: tuple[str, ...] = ()
     innovations, innovation_topics = collect_innovations_by_axis(aids, fusion_flags, vision_gate)
     if innovation_topics:
         topics.record_stream("ekf2_innovations", *innovation_topics)
-    notes = tuple(
-        f"{topic} has no measurement times, so the times of EKF2 innovations are publication times "
-        "(up to 0.2 s late)"
-        for topic in innovation_topics[:1]
-        if not any("timestamp_sample" in table for table in topics.tables_of(topic))
-    )
+        topic = innovation_topics[0]
+        if not any("timestamp_sample" in table for table in topics.tables_of(topic)):
+            notes = (
+                f"{topic} has no measurement times, so the times of EKF2 innovations are "
+                "publication times (up to 0.2 s late)",
+            )
     status_flags = aid_enabled_flags | {
         name: local_position[name] for name in VALIDITY_FLAGS if name in local_position
     }
@@ -169,13 +170,13 @@ def _find_state_vector(topics: Topics) -> tuple[str, int]:
     The topic is "" if it is not logged. The number is 0 for an unknown state vector.
     """
     for topic in STATE_VECTOR_TOPICS:
-        for table in topics.tables_of(topic)[:1]:
-            state_count = sum(name.startswith("states[") for name in table)
-            variance_count = sum(name.startswith("covariances[") for name in table)
-            if variance_count:
-                return topic, ATTITUDE_VARIANCE_COUNT_BY_ARRAY_LENGTHS.get(
-                    (state_count, variance_count), 0
-                )
+        table = topics.first_table(topic)
+        state_count = sum(name.startswith("states[") for name in table)
+        variance_count = sum(name.startswith("covariances[") for name in table)
+        if variance_count:
+            return topic, ATTITUDE_VARIANCE_COUNT_BY_ARRAY_LENGTHS.get(
+                (state_count, variance_count), 0
+            )
     return "", 0
 
 
@@ -221,17 +222,20 @@ def configured_step_s(topics: Topics) -> float:
 def _estimate_prediction_interval_s(topics: Topics) -> float:
     """Return EKF2's actual prediction interval (s), a multiple of the IMU interval."""
     configured_interval_s = configured_step_s(topics)
-    imu_time_s = topics.read(
-        MessageLayout(IMU_LAYOUT.topic, {"time": "timestamp"})
-    ).index.to_numpy()
-    if (
-        len(imu_time_s) < 2
-        or (interval_s := compute_median_interval_s(imu_time_s)) >= configured_interval_s
-    ):
+    # Only the times of both topics are needed
+    imu_layout, state_layout = (
+        MessageLayout(topic, {"time": "timestamp"})
+        for topic in (IMU_LAYOUT.topic, _find_state_vector(topics)[0])
+    )
+    imu_time_s = topics.read(imu_layout).index.to_numpy()
+    if len(imu_time_s) < 2:
         return configured_interval_s
-    layout = MessageLayout(_find_state_vector(topics)[0], {"states[0]": "states[0]"})
+    interval_s = compute_median_interval_s(imu_time_s)
+    if interval_s >= configured_interval_s:
+        return configured_interval_s
+    # A state has the time of the last IMU sample of its prediction
     imu_rows_at_prediction_ends = find_rows_of_timestamps(
-        imu_time_s, topics.primary_samples(layout).index
+        imu_time_s, topics.primary_samples(state_layout).index
     )
     # Compute sample indices from times, because IMU samples may be missing in the log
     prediction_end_indices = np.rint(
@@ -270,19 +274,21 @@ def compute_samples_per_step(
     """
     interval_ratio = configured_step_s / imu_interval_s
     # 1e-6 compensates rounding errors of the IMU interval
-    sample_count = max(int(interval_ratio + 0.5 + 1e-6), 1)
-    samples_between_logged_ends = np.diff(step_ends)
-    if (
-        sample_count > 1
-        and abs(interval_ratio + 0.5 - sample_count) < MAX_INTERVAL_RATIO_DISTANCE_FROM_HALF_INTEGER
-        and len(samples_between_logged_ends)
-    ):
-        fits_larger_count, fits_smaller_count = (
-            np.mean(samples_between_logged_ends % step_sample_count == 0.0) > 0.9
-            for step_sample_count in (sample_count, sample_count - 1)
-        )
-        return sample_count - int(fits_smaller_count and not fits_larger_count)
-    return sample_count
+    larger_count = max(int(interval_ratio + 0.5 + 1e-6), 1)
+    smaller_count = larger_count - 1
+    # For example: ratio 2.5, counts 3 and 2
+    is_ambiguous = (
+        abs(interval_ratio + 0.5 - larger_count) < MAX_INTERVAL_RATIO_DISTANCE_FROM_HALF_INTEGER
+    )
+    samples_between_ends = np.diff(step_ends)
+    if not smaller_count or not is_ambiguous or not len(samples_between_ends):
+        return larger_count
+    # Not all predictions are logged, so multiples of the count agree too
+    fits_larger_count, fits_smaller_count = (
+        np.mean(samples_between_ends % count == 0.0) > 0.9
+        for count in (larger_count, smaller_count)
+    )
+    return smaller_count if fits_smaller_count and not fits_larger_count else larger_count
 
 
 def _read_accelerometer_bias(
@@ -308,13 +314,13 @@ def _compute_horizon_delay_s(topics: Topics, step_s: float) -> float | Unavailab
 
 def _compute_publication_delay_s(topics: Topics, topic: str) -> pd.Series:
     """Return the delay (s) from measurement to publication, indexed by measurement time (s)."""
-    for table in topics.tables_of(topic)[:1]:
-        if "timestamp_sample" in table:
-            sample_times_us = get_measurement_times_us(table)
-            delay_us = table["timestamp"].astype(np.int64) - sample_times_us
-            sample_times_s = (sample_times_us - topics.time_origin_us) * 1e-6
-            return pd.Series(delay_us * 1e-6, time_index(sample_times_s))
-    return pd.Series(dtype=np.float64)
+    table = topics.first_table(topic)
+    if "timestamp_sample" not in table:
+        return pd.Series(dtype=np.float64)
+    sample_times_us = get_measurement_times_us(table)
+    delay_us = table["timestamp"].astype(np.int64) - sample_times_us
+    sample_times_s = (sample_times_us - topics.time_origin_us) * 1e-6
+    return pd.Series(delay_us * 1e-6, time_index(sample_times_s))
 
 
 def _read_fusion_flags(topics: Topics, enabled_aids: StepFunctions) -> TableOrUnavailable:
@@ -362,8 +368,8 @@ def _read_fusion_record(
     origin = local_samples.reindex(columns=["ref_lat", "ref_alt"]).ffill().iloc[-1]
     horizontal_columns = Columns.POSITION[:2]
     altitude_m = 0.0
-    # Since v1.16, the horizontal position in estimator_states is zero, and the height is the
-    # altitude above sea level (ekf_helper.cpp)
+    # Since v1.16, EKF2 logs zeros for the horizontal position, and the negative altitude as down
+    # position (ekf_helper.cpp). The altitude of the origin converts it to the local frame
     if not usable_state[horizontal_columns].to_numpy().any():
         usable_state[horizontal_columns] = np.nan
         altitude_m = float(np.nan_to_num(origin["ref_alt"]))
@@ -374,6 +380,7 @@ def _read_fusion_record(
         delayed_state=usable_state,
         has_delta_angle_biases=attitude_variance_count == QUATERNION_VARIANCE_COUNT,
         other_horizontal_aids=tuple(
+            # "vision velocity" is shorter than "external vision, velocity"
             AIDS[name].label.replace("external vision,", "vision")
             for name in OTHER_HORIZONTAL_AIDS
             if name in enabled_aids and enabled_aids[name].any()
@@ -406,10 +413,12 @@ def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
         topics.primary_samples(TOPIC_LAYOUTS[topic]).dropna()
         for topic in ("vehicle_magnetometer", "estimator_aid_src_mag")
     )
-    # EKF2 subtracts EKF2_MAG_DELAY and half a prediction interval from the times of observations
+    # EKF2 subtracts EKF2_MAG_DELAY and half a prediction interval from the times of observations.
+    # Add them again, so that both topics have the times of measurement
     delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     observations = observations.set_axis(observations.index + delay_s)
     field = max(magnetometer, observations, key=len)
+    # Below the rate of fusion, some samples are missing
     is_field_log_incomplete = len(field) <= MIN_MAGNETOMETER_HZ * topics.log.duration_s
     if is_field_log_incomplete and Columns.MAGNETIC_FIELD_INNOVATION[0] in observations:
         field = observations
@@ -433,14 +442,16 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     interval_s = flow_intervals["interval_us"].median() * 1e-6
     if not interval_s > 0.0 or flow_noise.empty:
         return pd.DataFrame()
+    # 1. Mean flow of the n samples between two logged outputs y of the low-pass filter:
+    # y_k = (1 - w)^n · y_(k-1) + (1 - (1 - w)^n) · mean, with the weight w of a new sample
     steps_s = flow_velocity.index.to_series().diff()
     sample_count = np.rint(steps_s / interval_s)
     previous_output_weight = (1.0 - FLOW_FILTER_NEW_SAMPLE_WEIGHT) ** sample_count
     filtered_velocity = flow_velocity[["forward_m_s", "right_m_s"]]
     previous_part = filtered_velocity.shift().mul(previous_output_weight, axis=0)
     flow = (filtered_velocity - previous_part).div(1.0 - previous_output_weight, axis=0)
-    # The noise is logged in rad/s. The range to the ground, velocity ÷ flow rate of the newest
-    # sample, converts it to m/s
+    # 2. Noise variance: it is logged in (rad/s)². The range to the ground, velocity ÷ flow rate of
+    # the newest sample, converts it to (m/s)²
     newest_velocity = flow_velocity[["newest_forward_m_s", "newest_right_m_s"]]
     flow_rate = flow_velocity[["x_rad_s", "y_rad_s"]]
     squared_range_m2 = (newest_velocity**2).sum(axis=1) / (flow_rate**2).sum(axis=1)

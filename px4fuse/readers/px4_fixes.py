@@ -4,10 +4,10 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, rms
-from px4fuse.flight.model import Columns, Ekf2, Unavailable, time_index
+from px4fuse.flight.model import Columns, Ekf2, Unavailable, rows_between, time_index
 
 from . import px4_topics as px4
-from .common import interpolate_inside_time_span
+from .common import interpolate_inside_time_span, join_nearest_samples
 from .px4_innovations import replace_vision_by_gnss_innovations
 from .ulog_topics import Topics
 
@@ -49,19 +49,19 @@ def read_unlogged_fixes(
         fixes = fixes.join(height)
     # EKF2 shifts GNSS times by half a prediction interval (estimator_interface.cpp)
     fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
-    next_row = np.clip(np.searchsorted(logged_fixes.index, fixes.index), 1, len(logged_fixes) - 1)
-    times_s, logged_times_s = fixes.index.to_numpy(), logged_fixes.index.to_numpy()
-    time_difference_to_logged_fix_s = np.abs(
-        logged_times_s[[next_row - 1, next_row]] - times_s
-    ).min(axis=0)
-    is_between_fixes = (times_s > logged_times_s[0]) & (times_s < logged_times_s[-1])
-    is_logged = time_difference_to_logged_fix_s <= MAX_TIME_DIFFERENCE_OF_SAME_FIX_S
-    # Before v1.16, the topic contains a local position (m), no latitude and longitude
+    # Latitude in the GNSS topic at the same time; NaN if the fix is not logged there
+    logged_latitude_deg = join_nearest_samples(
+        fixes[[]], logged_fixes[["latitude_deg"]].sort_index(), MAX_TIME_DIFFERENCE_OF_SAME_FIX_S
+    )["latitude_deg"]
+    # Before v1.16, EKF2's topic contains a local position (m), no latitude and longitude
     is_in_degrees = (
-        fixes["latitude_deg"][is_logged].sub(logged_fixes["latitude_deg"].median()).abs().median()
+        fixes["latitude_deg"].sub(logged_latitude_deg).abs().median()
         < MAX_DIFFERENCE_FROM_LOGGED_LATITUDE_DEG
     )
-    return fixes[~is_logged & is_between_fixes] if is_in_degrees else pd.DataFrame()
+    if not is_in_degrees:
+        return pd.DataFrame()
+    is_logged = logged_latitude_deg.notna()
+    return rows_between(fixes[~is_logged], logged_fixes.index[0], logged_fixes.index[-1])
 
 
 def reconstruct_fixes(
@@ -93,11 +93,12 @@ def reconstruct_fixes(
         or isinstance(east_innovations, Unavailable)
     ):
         return empty_result
-    # EKF2 fuses a fix that is older than the fusion horizon at the horizon (RingBuffer.h)
+    # 1. Time of measurement of each fused fix, known up to the next prediction step. EKF2 fuses a
+    # fix that is older than the fusion horizon at the horizon (RingBuffer.h)
     delay_beyond_horizon_s = max(0.0, delay_s - ekf2.horizon_s)
     fusion_times_s = north_innovations.index.to_numpy() - delay_beyond_horizon_s
-    # The receiver sends fixes at multiples of its interval after each logged fix. An innovation
-    # belongs to the latest of them
+    # 2. Exact time: the receiver sends fixes at multiples of its interval after each logged fix. An
+    # innovation belongs to the latest of them
     previous_fix_index = np.searchsorted(logged_fix_times_s, fusion_times_s) - 1
     interval_count, interval_fraction = np.divmod(
         (fusion_times_s - logged_fix_times_s[previous_fix_index]) / receiver_interval_s, 1.0
@@ -110,6 +111,7 @@ def reconstruct_fixes(
     )
     previous_fix_index, interval_count = previous_fix_index[rows], interval_count[rows]
     fix_times_s = logged_fix_times_s[previous_fix_index] + interval_count * receiver_interval_s
+    # 3. Position of the fix: EKF2 position at the time of the fusion, plus innovation
     reconstructed_fixes = pd.DataFrame(
         {
             column: interpolate_inside_time_span(
@@ -123,16 +125,17 @@ def reconstruct_fixes(
         },
         index=time_index(fix_times_s),
     )
-    # A reconstructed fix that is also logged shows the error of the reconstruction
+    # 4. Logged fixes, 0 intervals after a logged fix, show the error of the reconstruction
     is_logged = interval_count == 0.0
     previous_fixes = fixes[reconstructed_fixes.columns].to_numpy()[previous_fix_index]
     position_errors_m = (reconstructed_fixes - previous_fixes)[is_logged].dropna().to_numpy()
     reconstructed_fixes = reconstructed_fixes[~is_logged].dropna()
     reconstructed_fixes = reconstructed_fixes[~reconstructed_fixes.index.duplicated()]
-    if len(position_errors_m) < MIN_LOGGED_FIXES or reconstructed_fixes.empty:
-        return empty_result
-    rms_error_m = rms(position_errors_m)
-    if rms_error_m > MAX_FIX_RECONSTRUCTION_ERROR_M:
+    if (
+        len(position_errors_m) < MIN_LOGGED_FIXES
+        or reconstructed_fixes.empty
+        or rms(position_errors_m) > MAX_FIX_RECONSTRUCTION_ERROR_M
+    ):
         return empty_result
     for column in ("down_m", *Columns.POSITION_VARIANCE):
         reconstructed_fixes[column] = np.interp(
@@ -140,7 +143,7 @@ def reconstruct_fixes(
         )
     return reconstructed_fixes, (
         f"{len(reconstructed_fixes)} GNSS fixes are not logged. They are computed as EKF2 position "
-        f"plus innovation, with an RMS error of {rms_error_m:.2f} m along each axis"
+        f"plus innovation, with an RMS error of {rms(position_errors_m):.2f} m along each axis"
     )
 
 
@@ -150,12 +153,15 @@ def _estimate_receiver_interval(fix_times_s: Array) -> float | None:
     All logged intervals are multiples of this interval. Return None if the multiples are unknown.
     """
     logged_intervals_s = np.diff(fix_times_s)
+    # Deviation of each logged interval (row) from a multiple of each candidate (column)
     multiples = np.divide.outer(logged_intervals_s, CANDIDATE_FIX_INTERVALS_S)
     deviation_from_multiple_s = np.abs(multiples - np.round(multiples)) * CANDIDATE_FIX_INTERVALS_S
     percentile_98_of_deviation_s = np.percentile(deviation_from_multiple_s, 98, axis=0)
     is_possible = percentile_98_of_deviation_s <= MAX_DEVIATION_FROM_INTERVAL_MULTIPLE_S
     if not np.any(is_possible):
         return None
+    # Half or a third of the receiver's interval is possible too, so the longest interval is sought:
+    # best fit among the candidates within 10 % of the longest possible interval
     longest_interval_s = CANDIDATE_FIX_INTERVALS_S[is_possible].max()
     # Prefer long intervals: choose the candidate with the smallest deviation within 10 % of the
     # longest possible interval
@@ -164,6 +170,7 @@ def _estimate_receiver_interval(fix_times_s: Array) -> float | None:
     )
     best_index = np.argmin(np.where(is_near_longest, percentile_98_of_deviation_s, np.inf))
     interval_multiples = np.round(logged_intervals_s / CANDIDATE_FIX_INTERVALS_S[best_index])
+    # Element n: True if the multiple n is frequent in the log
     is_frequent = np.bincount(interval_multiples.astype(int)) >= MIN_LOGGED_INTERVALS_PER_MULTIPLE
     # The interval is known only if two successive multiples (n and n + 1) are frequent. If all
     # frequent multiples had a common divisor, such as 2 and 4, the interval could also be twice as

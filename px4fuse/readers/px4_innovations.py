@@ -241,14 +241,15 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
             is_step_function=True,
         )
     )
-    bits = topics.primary_samples(px4.TOPIC_LAYOUTS["control_bits"])["bits"].dropna()
+    if flags.columns.empty:  # PX4 before v1.12 logs a bit for each aiding source
+        bits = topics.primary_samples(px4.TOPIC_LAYOUTS["control_bits"])["bits"].dropna()
+        return {
+            aid.name: (bits.astype(np.int64) & (1 << aid.status_bit) > 0).astype(float)
+            for aid in all_aids
+            if aid.status_bit is not None and len(bits)
+        }
     enabled_aids = {}
     for aid in all_aids:
-        if flags.columns.empty:  # PX4 before v1.12
-            if aid.status_bit is not None and len(bits):
-                is_enabled = bits.astype(np.int64) & (1 << aid.status_bit) > 0
-                enabled_aids[aid.name] = is_enabled.astype(float)
-            continue
         # The names of flags depend on the PX4 release: the first group that is logged is used. The
         # aid is enabled while any flag of the group is set
         for group in aid.flags:
@@ -294,30 +295,33 @@ def _read_common_topics(
     is_in_gauss = aid.name == "mag_heading" and any(
         "cs_mag" in table for table in topics.tables_of(px4.STATUS_FLAGS_TOPIC)
     )
+    # Pairs of the topics with the innovations and with their variances
     possible_layouts = []
     if aid.fields and not is_in_gauss:
         innovation_topic, variance_topic = px4.INNOVATION_TOPICS
+        innovation_columns, variance_columns = (
+            _assign_fields_by_axis(quantity, aid, aid.fields)
+            for quantity in ("innovation", "variance")
+        )
         possible_layouts.append(
-            [
-                MessageLayout(
-                    innovation_topic, _assign_fields_by_axis("innovation", aid, aid.fields)
-                ),
-                MessageLayout(variance_topic, _assign_fields_by_axis("variance", aid, aid.fields)),
-            ]
+            (
+                MessageLayout(innovation_topic, innovation_columns),
+                MessageLayout(variance_topic, variance_columns),
+            )
         )
     if aid.ekf2_innovations_fields:
         field_by_column = _assign_fields_by_axis("innovation", aid, aid.ekf2_innovations_fields)
         variance_fields = aid.ekf2_innovations_fields.replace("innov", "innov_var")
         field_by_column |= _assign_fields_by_axis("variance", aid, variance_fields)
-        possible_layouts.append([MessageLayout(px4.OLD_INNOVATION_TOPIC, field_by_column)])
-    for layouts in possible_layouts:
-        # The innovations are in the first topic, their variances in the last
-        innovation = topics.primary_samples(layouts[0])[f"innovation_{aid.axes[0]}"]
-        variance_samples = topics.primary_samples(layouts[-1])
+        layout = MessageLayout(px4.OLD_INNOVATION_TOPIC, field_by_column)
+        possible_layouts.append((layout, layout))
+    for innovation_layout, variance_layout in possible_layouts:
+        innovation = topics.primary_samples(innovation_layout)[f"innovation_{aid.axes[0]}"]
+        variance_samples = topics.primary_samples(variance_layout)
         variance = variance_samples[f"variance_{aid.axes[0]}"]
         is_new_variance = (variance > 0.0) & variance.ne(variance.shift())
-        samples = topics.primary_samples(layouts[0], select_rows=_drop_repeats_and_zeros)
-        if len(layouts) == 2:
+        samples = topics.primary_samples(innovation_layout, select_rows=_drop_repeats_and_zeros)
+        if variance_layout is not innovation_layout:
             # The nearest variance S is used, because PX4 logs it at other times
             samples = join_nearest_samples(
                 samples, variance_samples.dropna(), MAX_TIME_FROM_INNOVATION_TO_VARIANCE_S
@@ -327,7 +331,7 @@ def _read_common_topics(
             samples = samples[sample_step_function(enabled_flag, samples.index) > 0.0]
         aid_log = _make_aid_log(
             topics,
-            tuple(layout.topic for layout in layouts),
+            tuple(dict.fromkeys((innovation_layout.topic, variance_layout.topic))),
             aid,
             samples,
             enabled_flag,

@@ -152,7 +152,9 @@ def make_track(
     quantisation_step_m = max(
         estimate_quantisation_step(samples[name].to_numpy()) for name in Columns.POSITION[:2]
     )
+    # True for each axis that the source measures
     is_measured = samples[Columns.POSITION].notna().any()
+    # Select the valid samples
     if origin.is_gnss:  # a receiver at rest may repeat its position
         samples = select_valid_rows(samples, needed_columns)
     else:
@@ -161,7 +163,7 @@ def make_track(
         track_fields["invalid_reasons"] = invalid_reasons[invalid_reasons != ""]
     if len(samples) < MIN_TRACK_SAMPLES:
         fault = f"the track has only {len(samples)} finite samples, fewer than {MIN_TRACK_SAMPLES}"
-        if is_measured["down_m"] and not is_measured[:"east_m"].any():
+        if is_measured["down_m"] and not is_measured[["north_m", "east_m"]].any():
             fault = HEIGHT_ONLY_REASON
         return unavailable_source(name, fault, remedy)
     if origin.kind == "uwb":
@@ -206,12 +208,12 @@ def _make_ulog_track(
     )
 
 
-def _describe_clock_without_measurement_times(topics: Topics, topic: str) -> ClockConversion | None:
-    """Describe the timestamps of a topic if they are not measurement times; otherwise return None.
+def _describe_unusual_clock(topics: Topics, topic: str) -> ClockConversion | None:
+    """Describe the timestamps of a topic if they are not measurement times, or often repeated.
 
     PX4 logs arrival times until it has received 500 TIMESYNC replies (``Timesync.cpp``).
     """
-    table = topics.tables_of(topic)[0]
+    table = topics.first_table(topic)
     if "timestamp_sample" not in table or len(table["timestamp"]) < MIN_TRACK_SAMPLES:
         return None
     published_us = table["timestamp"].astype(np.int64)
@@ -223,7 +225,7 @@ def _describe_clock_without_measurement_times(topics: Topics, topic: str) -> Clo
     elif abs(np.median(age_us)) > MAX_PUBLICATION_LAG_S * 1e6:
         clock_name = _describe_timestamp_clock(published_us, sample_timestamps_us)
         note = "timestamp_sample is not boot time in µs, so px4fuse uses arrival times"
-    else:
+    else:  # measurement times
         return describe_repeated_timestamps(
             SENDER_CLOCK, len(sample_timestamps_us), len(np.unique(sample_timestamps_us))
         )
@@ -257,7 +259,7 @@ def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable
         notes=(note,) if instance_count > 1 and not is_ekf2_topic else (),
         is_odometry=orientation is not None,
         frame=frame,
-        clock_map=_describe_clock_without_measurement_times(topics, layout.topic),
+        clock_map=_describe_unusual_clock(topics, layout.topic),
         orientation=orientation,
     )
 
@@ -268,24 +270,26 @@ def _describe_timestamp_clock(published_us: IntArray, sample_timestamps_us: IntA
     The unit follows from the rate of the timestamps relative to the publication times.
     """
     if not sample_timestamps_us.any():
-        return "0"
-    rate_ratio = np.ptp(published_us) / np.maximum(np.ptp(sample_timestamps_us), 1)
+        return "0"  # all timestamps are 0
+    # Duration (µs) of one unit of the timestamps
+    measured_unit_us = np.ptp(published_us) / np.maximum(np.ptp(sample_timestamps_us), 1)
     for unit, unit_us in MICROSECONDS_BY_UNIT.items():
-        if abs(rate_ratio / unit_us - 1.0) < MAX_CLOCK_RATE_ERROR_FRACTION:
-            median_s = np.median(sample_timestamps_us) * unit_us * 1e-6
-            if MIN_VALID_UNIX_TIME_S <= median_s < MAX_VALID_UNIX_TIME_S:
-                return f"UNIX time in {unit}"
-            # Timestamps that increase at the rate of µs, but are not boot times, are from another
-            # clock
-            return "another clock" if unit == "microseconds" else unit
+        if abs(measured_unit_us / unit_us - 1.0) >= MAX_CLOCK_RATE_ERROR_FRACTION:
+            continue
+        median_s = np.median(sample_timestamps_us) * unit_us * 1e-6
+        if MIN_VALID_UNIX_TIME_S <= median_s < MAX_VALID_UNIX_TIME_S:
+            return f"UNIX time in {unit}"
+        # The unit of boot times is µs. Other timestamps in µs are from another clock
+        return "another clock" if unit == "microseconds" else unit
     return "an unknown clock"
 
 
 def _read_fused_observation(topics: Topics, is_odometry: bool) -> PositionTrack | Unavailable:
     horizontal = TOPIC_LAYOUTS["estimator_aid_src_ev_pos"]
     vertical = TOPIC_LAYOUTS["estimator_aid_src_ev_hgt"]
-    layouts = (horizontal, vertical)
-    topic_names = tuple(layout.topic for layout in layouts if topics.find_layout(layout))
+    topic_names = tuple(
+        layout.topic for layout in (horizontal, vertical) if topics.find_layout(layout)
+    )
     if horizontal.topic not in topic_names:
         return unavailable_source(FUSED_OBSERVATION_TRACK_NAME)
     return _make_track_from_ekf2_topics(
@@ -312,24 +316,22 @@ def _make_track_from_ekf2_topics(
 ) -> PositionTrack | Unavailable:
     """Make a position track from horizontal positions and heights in EKF2's topics.
 
-    EKF2 subtracted EKF2_EV_DELAY from the timestamps. The delay is added again.
+    EKF2 subtracted EKF2_EV_DELAY from the timestamps. The delay is added again, and ``shift_s``.
     """
     notes: tuple[str, ...] = ()
     if len(height_samples):
-        samples = join_nearest_samples(
-            samples, height_samples.assign(_found=True), MAX_TIME_FROM_POSITION_TO_HEIGHT_S
-        )
-        if missing_count := samples.pop("_found").isna().sum():
+        samples = join_nearest_samples(samples, height_samples, MAX_TIME_FROM_POSITION_TO_HEIGHT_S)
+        if missing_count := samples["down_m"].isna().sum():
             notes = (
                 f"{missing_count} of {len(samples)} external vision positions have no height "
                 f"within {1e3 * MAX_TIME_FROM_POSITION_TO_HEIGHT_S:.0f} ms and are used without "
                 "height",
             )
-    shift_s += topics.log.parameters.get(EV_POS.delay, 0.0) * 1e-3
+    delay_s = topics.log.parameters.get(EV_POS.delay, 0.0) * 1e-3
     return _make_ulog_track(
         topics,
         name,
-        _shift_times(samples, shift_s),
+        _shift_times(samples, shift_s + delay_s),
         topic_names,
         needed_columns=Columns.POSITION[:2],
         notes=notes,
@@ -462,17 +464,18 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
             f"the log has {len(messages)} {GPS_POSITION_TOPIC}, none with a 3D fix",
             NO_FIX_ACTION,
         )
+    # 1. Times of measurement
     parameters = topics.ekf2_parameters
     age_s = fixes["published_s"] - fixes.index
-    if GNSS_MODE_PARAMETER in parameters and (
-        age_s.max() > MAX_ARRIVAL_TO_PUBLICATION_DELAY_US * 1e-6
-    ):
+    has_measurement_times = age_s.max() > MAX_ARRIVAL_TO_PUBLICATION_DELAY_US * 1e-6
+    if GNSS_MODE_PARAMETER in parameters and has_measurement_times:
         delay_s = 0.0
         clock = "autopilot boot clock: measurement times from the GNSS driver"
     else:
         delay_s = fill_parameters_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay] * 1e-3
         fixes = fixes.set_axis(time_index(fixes["published_s"].to_numpy() - delay_s))
         clock = f"autopilot boot clock: timestamp minus {GNSS_POS.delay} ({1e3 * delay_s:g} ms)"
+    # 2. Add the fixes that the GNSS topic lacks, from EKF2's topics
     unlogged_fixes = read_unlogged_fixes(topics, fixes, ekf2)
     if len(unlogged_fixes):
         fixes = pd.concat([fixes, unlogged_fixes]).sort_index()
@@ -480,6 +483,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         # EKF2's topics lack some fields of a fix: copy these fields from the previous fix
         fixes = fixes.assign(altitude_m=fixes["altitude_m"].interpolate("index")).ffill()
     samples = convert_gnss_fixes(fixes, _find_local_origin(topics))
+    # 3. Without such topics, compute the missing fixes from EKF2's innovations
     rate_hz = compute_sample_rate_hz(samples)
     notes, is_downsampled = list[str](), rate_hz < MAX_DOWNSAMPLED_HZ
     if is_downsampled:
@@ -545,7 +549,7 @@ def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFram
 def read_truth(
     topics: Topics, positions: tuple[PositionTrack, ...], ekf2: Ekf2 | Unavailable
 ) -> Truth | Unavailable:
-    """Read ground truth from simulation or motion capture.
+    """Read ground truth from simulation (local, or else global position), or motion capture.
 
     If EKF2 fused GNSS, ground truth is shifted from the simulation's origin to EKF2's origin.
     """
@@ -562,22 +566,22 @@ def read_truth(
             return Truth(global_layout.topic, projected_positions.join(velocity), attitude)
         if has_fused_aid(ekf2):
             local_samples = local_samples.copy()
-            # the origins of both frames may differ by a constant offset
+            # The frames differ by a constant on each axis; NaN if the topics have no common times
             for column in Columns.POSITION:
-                local_truth_m = interpolate_inside_time_span(
+                shift_m = projected_positions[column] - interpolate_inside_time_span(
                     projected_positions.index, local_samples[column]
                 )
-                shift_m = (projected_positions[column] - local_truth_m).median()
-                local_samples[column] += np.nan_to_num(shift_m)
+                local_samples[column] += np.nan_to_num(shift_m.median())
     if len(local_samples):
         return Truth(local_layout.topic, local_samples, attitude)
-    mocap_truth = find_motion_capture_truth(positions)
+    if mocap_truth := find_motion_capture_truth(positions):
+        return mocap_truth
     reason = "the log has neither simulation ground truth nor motion capture"
     remedy = TRACK_SOURCES["vehicle_mocap_odometry"].remedy
     if len(logged_local_samples):
         reason = f"{local_layout.topic} has no finite sample"
         remedy = "Check the simulation that writes the ground truth."
-    return mocap_truth or Unavailable("ground truth", reason, remedy)
+    return Unavailable("ground truth", reason, remedy)
 
 
 def find_motion_capture_truth(positions: tuple[PositionTrack, ...]) -> Truth | None:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import msgspec
-from msgspec import structs
 
 from px4fuse.core.record import read_toml
 from px4fuse.flight.ekf2_parameters import AIDS
@@ -26,8 +25,6 @@ class TrackSource:
     # Advice if the positions of this source are not logged
     remedy: str
     kind: str = "uwb"
-    # False if EKF2 never fuses these positions
-    fused: bool = True
     # Coordinate frame of the positions; if "unknown", the topic may contain it
     frame: str = "unknown"
     # Names of the possible topic definitions in ``px4_topics.toml``, preferred first
@@ -35,8 +32,7 @@ class TrackSource:
 
     @property
     def origin(self) -> SourceOrigin:
-        origin = find_source_origin(self.kind, self.route)
-        return origin if self.fused else structs.replace(origin, aid=None)
+        return find_source_origin(self.kind, self.route)
 
 
 _TOPIC_TABLES = read_toml(__file__, dict[str, dict[str, Any]])

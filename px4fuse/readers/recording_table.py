@@ -209,10 +209,8 @@ def find_position_table(
     text = decode_text(content)
     if text is None:
         raise LogError(f"{file_name} is a binary file, not a text table", "Give a CSV file.")
-    # The last line may be incomplete if it has no line feed
-    whole_lines, _, last_line = text.rpartition("\n")
-    is_last_line_complete = _is_complete_line(last_line, whole_lines.rpartition("\n")[2])
-    text = f"{text if is_last_line_complete else whole_lines}\n"
+    text, notes = _drop_incomplete_last_line(text)
+    # The header is searched in the first lines only
     unquoted_text = text.replace('"', "")
     header_text = unquoted_text[: unquoted_text.rfind("\n", 0, MAX_HEADER_CHARS) + 1]
     lines = header_text.split("\n")[:MAX_HEADER_LINES]
@@ -229,6 +227,7 @@ def find_position_table(
     table = table or _find_header_table(file_name, unquoted_text, lines, wanted_names)
     if table is None and not wanted_names:
         table = _find_headerless_table(path, unquoted_text, lines)
+    # Columns that the user names need no meaning
     if table is None or not (columns or _has_time_and_position(table.column_names)):
         column_list = ", ".join(map(quote, sorted(wanted_names))) or "time, x, y, z"
         raise LogError(
@@ -237,19 +236,29 @@ def find_position_table(
             f"Add the header time,x,y,z. Alternatively, name the columns with {COLUMNS_OPTION}.",
         )
     table.check_row_width()
-    if last_line.strip() and not is_last_line_complete:
-        note = "the last line of the position file was dropped, because it is incomplete"
-        return replace(table, notes=(*table.notes, note))
-    return table
+    return replace(table, notes=(*table.notes, *notes))
 
 
-def _is_complete_line(line: str, line_before: str) -> bool:
-    """Return True if a line has as many columns and decimals as the line before it."""
-    cells, cells_before = (re.split(r"[\s,;]+", text.strip()) for text in (line, line_before))
+def _drop_incomplete_last_line(text: str) -> tuple[str, tuple[str, ...]]:
+    """Return a text that ends with a line feed, and a note if its last line was dropped.
+
+    A last line without line feed may be incomplete.
+    """
+    whole_lines, _, last_line = text.rpartition("\n")
+    line_before = whole_lines.rpartition("\n")[2]
+    cells, cells_before = (re.split(r"[\s,;]+", line.strip()) for line in (last_line, line_before))
     decimals, decimals_before = (
         row_cells[-1].partition(".")[2] for row_cells in (cells, cells_before)
     )
-    return "." in line and len(cells) == len(cells_before) and len(decimals) >= len(decimals_before)
+    # A complete line has as many columns and decimals as the line before it
+    if (
+        "." in last_line
+        and len(cells) == len(cells_before)
+        and len(decimals) >= len(decimals_before)
+    ):
+        return f"{text}\n", ()
+    note = "the last line of the position file was dropped, because it is incomplete"
+    return f"{whole_lines}\n", (note,) if last_line.strip() else ()
 
 
 def _split_line(line: str, separator: str) -> list[str]:
@@ -303,17 +312,28 @@ def _find_body_table(
     header = pd.DataFrame(zip_longest(*rows, fillvalue=""))[: len(rows[axes_row])]
     axes, rows_text = header[axes_row], text.split("\n", axes_row + 1)[axes_row + 1]
     if is_motive:
+        format_name, first_columns, rate_hz = (
+            "OptiTrack Motive CSV export",
+            rows[axes_row][:2],
+            None,
+        )
+        # Motive exports y up by default, or z up; the file does not state which
+        frames: tuple[str, ...] = ("eus", "enu")
         unit = dict(zip(rows[0][::2], rows[0][1::2], strict=False)).get("Length Units", "")
         values_by_title = {header.loc[1, row]: header[row] for row in range(2, axes_row)}
         body_names = values_by_title.get("Name", axes)
+        # Rotations are not read, because the axes of a rigid body are not FRD
+        is_position = header[axes_row - 1] == "Position"
         # If the header line Type is missing or names no rigid body, the user can choose any column
         # group as the tracked body
         is_rigid_body = values_by_title.get("Type", axes) == "Rigid Body"
-        # Rotations are not read, because the axes of a rigid body are not FRD
-        is_position = header[axes_row - 1] == "Position"
-        is_position &= is_rigid_body | (not is_rigid_body.any())
+        if is_rigid_body.any():
+            is_position &= is_rigid_body
         column_names = axes + f"_{unit}"
     else:
+        format_name, first_columns = "Vicon Nexus CSV export", ["time", ""]
+        frames, rate_hz = (), float(rows[1][0])
+        # A body name stands only above the first column of the body
         body_names = header[2].replace("", None).ffill().fillna("")
         axes = axes.str.removeprefix("T")
         is_position = axes.isin([*"XYZ"])
@@ -322,16 +342,14 @@ def _find_body_table(
         rows_text = re.split(r"\n[, ]*\n", rows_text.partition("\n")[2], maxsplit=1)[0] + "\n"
     chosen_body_name = choose_body(file_name, body_names[is_position], wanted_body)
     is_chosen = is_position & (body_names == chosen_body_name)
-    first_columns = rows[axes_row][:2] if is_motive else ["time", ""]
     return PositionTable(
         file_name,
-        "OptiTrack Motive CSV export" if is_motive else "Vicon Nexus CSV export",
+        format_name,
         [*first_columns, *column_names.where(is_chosen, "")[2:]],
         rows_text,
         header_line_number=axes_row + 1,
-        # Motive exports y up by default, or z up; the file does not state which
-        frames=("eus", "enu") if is_motive else (),
-        rate_hz=None if is_motive else float(rows[1][0]),
+        frames=frames,
+        rate_hz=rate_hz,
         has_only_chosen_body=True,
         notes=(f"the positions are those of body {quote(chosen_body_name)}",),
     )
@@ -385,6 +403,7 @@ def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> Posit
     first_row = _remove_comments("\n".join(lines)).strip().partition("\n")[0]
     for separator in SEPARATORS:
         fields = _split_line(first_row, separator)
+        # With another separator, a comma may be the decimal point
         decimal_fields = [field.replace(",", ".") for field in fields]
         if not 4 <= len(fields) <= MAX_COLUMNS or not all(map(is_number, decimal_fields[1:])):
             continue
@@ -398,11 +417,18 @@ def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> Posit
             elif separator == "," and len(fields) in (8, 17) and len(fields[0]) == 19:
                 name, quaternion_order = "EuRoC ground truth", "wxyz"
             column_names = ["time", "x", "y", "z", *(f"q{axis}" for axis in quaternion_order)]
+            # The other columns have no name and are not read
             column_names += [""] * (len(fields) - len(column_names))
             note = "the file has no header: columns 1 to 4 are read as time, x, y, z"
             rows_text = _remove_comments(text)
             return PositionTable(
-                display_name(path), name, column_names, rows_text, separator, 0, notes=(note,)
+                display_name(path),
+                name,
+                column_names,
+                rows_text,
+                separator,
+                header_line_number=0,
+                notes=(note,),
             )
     return None
 

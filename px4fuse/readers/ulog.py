@@ -99,7 +99,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
         unused=tuple(
             UnusedData(name, len(table["timestamp"]), reason)
             for name, reason in UNUSED_TOPICS.items()
-            for table in topics.tables_of(name)[:1]
+            if (table := topics.first_table(name))
         ),
     )
 

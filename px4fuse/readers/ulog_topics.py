@@ -81,9 +81,16 @@ class _ULogContent(io.BytesIO):
     skipped_bytes = 0
     header_start_offset = read_end_offset = position = 0  # byte offsets in the file
 
-    def read(self, size: int, /) -> bytes:  # type: ignore[override]  # pyulog always gives a size
+    def read(self, size: int, /) -> bytes:  # type: ignore[override]  # pyulog gives a size
+        """Return ``size`` bytes from the current position.
+
+        pyulog reads each message as a header and a content. Before a header, all samples up to the
+        next message that is not a sample are read here. pyulog continues after these samples.
+        """
         start = self.position
         if size == HEADER_BYTES:
+            # After an invalid message, pyulog seeks to a later position. The bytes from the header
+            # of the invalid message to this position are damaged
             if start != self.read_end_offset:
                 self.skipped_bytes += start - self.header_start_offset
             if self.parser is not None:
@@ -224,15 +231,22 @@ class Topics:
         """Return the tables of all instances of a topic, by ascending instance number."""
         return [self.tables[topic, number] for number in self.instances(topic)]
 
+    def first_table(self, topic: str) -> TopicArrays:
+        """Return the table of the lowest instance number; empty if the topic is not logged."""
+        tables = self.tables_of(topic)
+        return tables[0] if tables else {}
+
     @cached_property
     def primary_instances(self) -> InstanceSwitches:
         """Time (s) and number of each new primary EKF2 instance (PX4's ``EKF2Selector``)."""
         instances = self.read(TOPIC_LAYOUTS["estimator_selector_status"])["instance"]
         instances = instances[instances < 255]  # 255 means that no instance is selected yet
-        primary_instance_changes = instances[instances.ne(instances.shift())]
-        switch_times_s = [-np.inf, *primary_instance_changes.index[1:]]
-        numbers = primary_instance_changes.astype(int).tolist()
-        return tuple(zip(switch_times_s, numbers, strict=False)) or NO_INSTANCE_SWITCHES
+        changes = instances[instances.ne(instances.shift())].astype(int)
+        if changes.empty:
+            return NO_INSTANCE_SWITCHES
+        # The first instance counts as primary from the beginning of the log
+        switch_times_s = [-np.inf, *changes.index[1:]]
+        return tuple(zip(switch_times_s, changes.tolist(), strict=True))
 
     def find_layout(self, *layouts: MessageLayout) -> MessageLayout | None:
         """Return the first topic definition whose required fields are in the log, or None."""
@@ -256,7 +270,7 @@ class Topics:
         DataFrame
             Samples with strictly increasing times.
         """
-        table = self.tables.get((layout.topic, instance)) or self.tables_of(layout.topic)[0]
+        table = self.tables.get((layout.topic, instance)) or self.first_table(layout.topic)
         fields = {
             column: field_name
             for column, field_name in {**layout.columns, **layout.optional_columns}.items()
@@ -397,7 +411,8 @@ def read_topics(name: str, content: bytes) -> Topics:
         with contextlib.redirect_stdout(io.StringIO()):  # suppress the warnings that pyulog prints
             ulog = _TolerantULogParser(content_reader, message_name_filter_list=list_topics())
             tables = _read_tables(ulog)
-            # Without known topics, read all topics, because the duration of the log is needed
+            # Without known topics, read all topics, because the duration of the log and the names
+            # of its topics are needed
             known_or_all_topic_tables = tables or _read_tables(
                 _TolerantULogParser(_ULogContent(content))
             )
@@ -420,7 +435,8 @@ def read_topics(name: str, content: bytes) -> Topics:
     time_origin_us, data_end_us = _find_data_span_us(known_or_all_topic_tables, name)
     logged_values, parameter_changes = _read_parameters(ulog, tables, time_origin_us)
     parameter_values, invalid_parameter_notes = replace_invalid_parameters(logged_values)
-    # pyulog has read the file up to its last header. The rest is an incomplete message
+    # pyulog stops at a message whose content is longer than the rest of the file. The file is then
+    # longer than the offset of the last header, and shorter than the end of the last reading
     last_header_offset = content_reader.header_start_offset
     is_truncated = last_header_offset < len(content) < content_reader.read_end_offset
     log = LogInfo(

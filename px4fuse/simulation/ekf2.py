@@ -44,6 +44,7 @@ from px4fuse.ekf2.replay_segments import (
     find_step_ends,
     make_magnetic_field_samples,
 )
+from px4fuse.ekf2.vision import HORIZONTAL_VELOCITY
 from px4fuse.flight.ekf2_parameters import (
     BAROMETER,
     EV_POS,
@@ -67,6 +68,7 @@ from . import sensors
 from .ekf2_topics import (
     VEHICLE_AID_SOURCE_LOG_RATE_HZ,
     Ekf2Output,
+    compute_time_since_last_event_s,
     make_ekf2_topics,
 )
 from .faults import FaultSizes
@@ -155,7 +157,9 @@ def simulate_ekf2(
     ``imu``, ``source`` and ``other_sensors`` contain all samples, also those that are not logged.
     """
     aid = scenario.aid
+    # 1. Prediction steps, and the sensors for height and heading
     segment = _make_segment(scenario, faults, motion, imu)
+    # The log contains float32 values
     logged_values = {name: float(np.float32(value)) for name, value in log_parameters.items()}
     step_s = float(np.median(segment.step_s))
     if other_sensors:
@@ -178,6 +182,7 @@ def simulate_ekf2(
                 np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)]),
                 np.full(6, MAGNETIC_FIELD_SIGMA_GAUSS**2),
             )
+    # 2. Rules for the fusion of the positions, and the fusion horizon
     settings = fill_parameters_with_defaults(logged_values, *_select_fused_aids(scenario))
     rules = GNSS_RULES if aid == GNSS_POS else VISION_RULES
     if not int(log_parameters[aid.switch]) & 1:
@@ -186,6 +191,7 @@ def simulate_ekf2(
         rules = replace(rules, max_sample_interval_to_start_s=0.0)
     # EKF2 delays the fusion by the length of its IMU buffer, in steps (estimator_interface.cpp)
     buffer_length = int(np.ceil(1e3 * settings["EKF2_DELAY_MAX"] / PREDICTION_STEP_US))
+    # 3. Run of the EKF2 model, and its topics
     inputs = ReplayInputs(
         settings=settings,
         segments=(segment,),
@@ -214,12 +220,16 @@ def _add_barometer(
 ) -> ReplaySegment:
     """Add the barometer samples, which are EKF2's only height source outdoors."""
     down_m = sensors.HOME_POSITION[2] - barometer.fields["baro_alt_meter"].astype(float)
+    # No ground effect; each sample represents itself only
     samples = pd.DataFrame(
         {"down_m": down_m, "dead_zone_m": 0.0, "weight": 1.0}, measurement_times_s
     )
     step_indices, is_inside = find_sample_steps(segment, measurement_times_s)
-    name = BAROMETER.name
-    height_samples = HeightSamples((name,), name, np.zeros(2), step_indices, samples[is_inside])
+    # The barometer is the only fused height sensor, and the reference, so no sensor has a bias
+    name, bias_and_variance = BAROMETER.name, np.zeros(2)
+    height_samples = HeightSamples(
+        (name,), name, bias_and_variance, step_indices, samples[is_inside]
+    )
     return replace(segment, height_samples=height_samples)
 
 
@@ -227,6 +237,7 @@ def _make_segment(
     scenario: Scenario, faults: FaultSizes, motion: Motion, imu: Topic
 ) -> ReplaySegment:
     """Return the input of the EKF2 model."""
+    # 1. Sums of the IMU samples in each prediction step
     time_us = sensors.get_time_us(imu)
     interval_s = np.diff(time_us) * 1e-6
     step_end_indices = find_step_ends(
@@ -237,6 +248,7 @@ def _make_segment(
         imu.fields["accelerometer_m_s2"][1:].astype(float) * interval_s[:, None],
         step_end_indices,
     )
+    # 2. Attitude at the start and after each step
     time_s = time_us[np.concatenate([[0], step_end_indices])] * 1e-6
     body_to_ned = motion.compute_body_to_ned(time_s)
     true_quaternions = sensors.to_quaternions(body_to_ned)
@@ -346,6 +358,7 @@ def _select_accepted_positions(source: sensors.SimulatedPositions) -> ReceivedPo
 
 
 def _compute_output(inputs: ReplayInputs, model_run: SegmentRun) -> Ekf2Output:
+    """Compute the states at the fusion horizon, and those that the output predictor publishes."""
     segment = model_run.segment
     true_quaternions = sensors.to_quaternions(segment.body_to_ned)
     lag_steps = round(inputs.horizon_s / inputs.mean_step_s)
@@ -353,10 +366,11 @@ def _compute_output(inputs: ReplayInputs, model_run: SegmentRun) -> Ekf2Output:
     reset_steps, reset_sizes_m, has_recent_position_aiding = _hold_position_without_aiding(
         model_run, state
     )
+    # The height is never reset
     reset_m = np.zeros((len(state), 3))
     reset_m[reset_steps, :2] = reset_sizes_m
-    # Attitude error (NED) of the output predictor, which integrates the newest gyro samples. It
-    # subtracts the older gyro bias of the fusion horizon
+    # Attitude error (NED) of the output predictor. 1. It integrates the newest gyro samples, from
+    # which it subtracts the older gyro bias of the fusion horizon
     gyro_bias_rad_s = rotate(segment.body_to_ned[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:])
     attitude_error_increments_rad = (
         -segment.attitude_correction_rad - gyro_bias_rad_s * segment.step_s[:, None]
@@ -400,23 +414,21 @@ def _hold_position_without_aiding(
     """
     events, time_s = model_run.events[0], model_run.segment.time_s
     aiding_steps = events.end_step[model_run.fused[:, 0] | model_run.reset[:, 0]]
-    time_of_aiding_s = np.zeros(len(time_s))
-    time_of_aiding_s[aiding_steps] = time_s[aiding_steps]
     has_recent_position_aiding = (
-        time_s - np.maximum.accumulate(time_of_aiding_s) <= NO_AID_TIMEOUT_S
+        compute_time_since_last_event_s(time_s, aiding_steps, 0.0) <= NO_AID_TIMEOUT_S
     )
-    # the product is the number of a step with aiding, and 0 for other steps, so the running maximum
-    # is the last step with aiding
+    # Hold the position of the last step with recent aiding, at rest. The steps without aiding are
+    # replaced by 0, so that the running maximum is the last step with aiding
     last_step_with_aiding = np.maximum.accumulate(
         np.arange(len(time_s)) * has_recent_position_aiding
     )
     state[:, HORIZONTAL_POSITION] = state[last_step_with_aiding, HORIZONTAL_POSITION]
-    state[~has_recent_position_aiding, VELOCITY.start : VELOCITY.start + 2] = 0.0
+    state[~has_recent_position_aiding, HORIZONTAL_VELOCITY] = 0.0
     reset_events = np.flatnonzero(model_run.reset[:, 0])
     reset_steps = events.end_step[reset_events]
     steps_before_reset = reset_steps - 1
-    # a reset moves EKF2's position to the measured position: from the estimated position with
-    # recent aiding, otherwise from the held position
+    # A reset moves the position to the measured position. Its size is the innovation relative to
+    # the estimated position, or, after a time without aiding, the difference from the held position
     reset_sizes_m = np.where(
         has_recent_position_aiding[steps_before_reset, None],
         model_run.innovation[reset_events, 0, HORIZONTAL_POSITION_COLUMNS],

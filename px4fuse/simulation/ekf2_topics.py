@@ -124,17 +124,23 @@ def _make_local_position_topic(model_inputs: ReplayInputs, ekf2_output: Ekf2Outp
     logged_steps = np.flatnonzero(
         is_kept_at_rate(to_seconds(ekf2_output.time_us), LOCAL_POSITION_LOG_RATE_HZ)
     )
+    # Size of the last reset; row 0 is the size before the first reset
     reset_sizes_m = np.concatenate([np.zeros((1, 2)), ekf2_output.reset_sizes_m])
     reset_count = np.searchsorted(ekf2_output.reset_steps, logged_steps, side="right")
-    fields = make_timestamps(ekf2_output.time_us[logged_steps], PUBLICATION_DELAY_US)
-    fields |= split_vectors(
-        {"": ekf2_output.position_m[logged_steps], "v": ekf2_output.velocity_m_s[logged_steps]}
-    )
+    # Aiding at the fusion horizon, lag_steps before the publication
     has_recent_position_aiding = ekf2_output.has_recent_position_aiding[
         np.maximum(logged_steps - ekf2_output.lag_steps, 0)
     ]
-    fields |= {"delta_xy": reset_sizes_m[reset_count], "xy_reset_counter": reset_count % 256}
-    fields |= dict.fromkeys(("xy_valid", "v_xy_valid"), has_recent_position_aiding)
+    fields = {
+        **make_timestamps(ekf2_output.time_us[logged_steps], PUBLICATION_DELAY_US),
+        **split_vectors(
+            {"": ekf2_output.position_m[logged_steps], "v": ekf2_output.velocity_m_s[logged_steps]}
+        ),
+        "delta_xy": reset_sizes_m[reset_count],
+        "xy_reset_counter": reset_count % 256,
+        "xy_valid": has_recent_position_aiding,
+        "v_xy_valid": has_recent_position_aiding,
+    }
     if model_inputs.aid == GNSS_POS:
         fields |= dict(zip(("ref_lat", "ref_lon", "ref_alt"), HOME_POSITION, strict=True))
     return make_topic("vehicle_local_position", fields)
@@ -154,15 +160,21 @@ def _make_states_topic(
         np.diff(end_step, prepend=0) > 0, end_step, STATES_LOG_RATE_HZ
     )
     logged_steps = end_step[logged_indices]
-    states = np.zeros((len(logged_steps), 25), np.float32)
-    states[:, 0:4] = ekf2_output.attitude_at_fusion_horizon[logged_steps]
-    states[:, 4 : 4 + ekf2_output.states_at_fusion_horizon.shape[1]] = (
-        ekf2_output.states_at_fusion_horizon[logged_steps]
+    # 25 states: quaternion, velocity, position, IMU biases, magnetic fields, wind and terrain.
+    # States that the EKF2 model does not contain are 0
+    model_states = np.hstack(
+        [
+            ekf2_output.attitude_at_fusion_horizon[logged_steps],
+            ekf2_output.states_at_fusion_horizon[logged_steps],
+        ]
     )
-    states[:, 7:9] = 0.0
+    states = np.zeros((len(logged_steps), 25), np.float32)
+    states[:, : model_states.shape[1]] = model_states
+    states[:, 7:9] = 0.0  # position north and east
     if model_inputs.aid == GNSS_POS:
         # with a global origin, v1.16 logs the altitude instead of the down position
         states[:, 9] -= HOME_POSITION[2]
+    # 24 variances: the attitude has 3, about the NED axes
     variances = np.zeros((len(logged_steps), 24), np.float32)
     # row 0 of the variances is before the first event, so the row after event i is i + 1
     variances[:, : model_run.variance.shape[2]] = model_run.variance[logged_indices + 1, 0]
@@ -176,6 +188,7 @@ def _make_position_aid_topics(
     model_inputs: ReplayInputs, model_run: SegmentRun, ekf2_output: Ekf2Output, rate_hz: float
 ) -> tuple[Topic, ...]:
     """Make estimator_aid_src_* of the position source, with one message per usable position."""
+    # Last index 0 of the arrays of model_run: its only filter configuration
     events, positions = model_run.events[0], model_inputs.received_positions
     # select events with a position that EKF2 can use: in a gap, an event has no position, and a
     # position may arrive too late
@@ -196,10 +209,12 @@ def _make_position_aid_topics(
     position_noise_variance = noise_variance[:, HORIZONTAL_POSITION_COLUMNS]
     position_innovation = innovation[:, HORIZONTAL_POSITION_COLUMNS]
     is_untested = np.isnan(position_innovation[:, :1])
+    # EKF2 also sets time_last_fuse at a reset to the position
     is_used = is_fused | model_run.reset[logged_indices, 0]
     last_fused_us = np.maximum.accumulate(
         is_used * (FIRST_TIMESTAMP_US + ekf2_output.time_us[logged_steps])
     )
+    # Outdoors, v1.16 logs latitude and longitude
     observation = measured_m
     if positions.velocity_m_s is not None:
         north_m, east_m = measured_m.T
@@ -245,8 +260,8 @@ def _make_barometer_topics(
     height_samples, end_step = model_run.segment.height_samples, model_run.events[0].end_step
     if height_samples is None or model_run.height_filter is None:
         return []
-    # the table gets step numbers instead of times of events, so its column "fused_at_s" contains
-    # step numbers
+    # Updates of the first configuration. The table copies the times of the events to the column
+    # fused_at_s. With step numbers instead of times, this column contains step numbers
     updates = model_run.height_filter.make_update_table(BAROMETER.name, 0, end_step.astype(float))
     last_published_step = len(ekf2_output.time_us) - ekf2_output.lag_steps - 1
     # EKF2 does not log the first sample, which only initialises the height
@@ -346,21 +361,31 @@ def _make_aid_source_topic(
     return make_topic(f"estimator_aid_src_{aid.name}", fields)
 
 
+def compute_time_since_last_event_s(time_s: Array, event_steps: IntArray, start_s: float) -> Array:
+    """Return the time (s) since the last event at each step.
+
+    ``start_s`` is the time of an event before the first step, or minus infinity.
+    """
+    last_event_s = np.full(len(time_s), start_s)
+    last_event_s[event_steps] = time_s[event_steps]
+    # The maximum of all earlier events is the last event
+    return time_s - np.maximum.accumulate(last_event_s)
+
+
 def _make_flags_topic(
     model_inputs: ReplayInputs, model_run: SegmentRun, ekf2_output: Ekf2Output
 ) -> Topic:
     """Return estimator_status_flags: a message each second, and at each start or end of fusion."""
     events, time_s = model_run.events[0], model_run.segment.time_s
-    steps_with_fusion_attempt = events.end_step[
+    # A rejected position is an attempt too: the flag stays set during rejections
+    attempt_steps = events.end_step[
         model_run.fused[:, 0] | model_run.rejected[:, 0] | model_run.reset[:, 0]
     ]
-    last_attempt_s = np.full(len(time_s), -np.inf)
-    last_attempt_s[steps_with_fusion_attempt] = time_s[steps_with_fusion_attempt]
-    # the running maximum of the times of fusion attempts is the time of the last attempt
-    time_since_attempt_s = time_s - np.maximum.accumulate(last_attempt_s)
+    time_since_attempt_s = compute_time_since_last_event_s(time_s, attempt_steps, -np.inf)
     is_fusing = time_since_attempt_s < model_inputs.rules.stop_timeout_s
     has_changed = np.diff(is_fusing, prepend=False)
     is_logged = has_changed | is_kept_at_rate(time_s, FLAGS_LOG_RATE_HZ)
+    # The last lag_steps are not published before the end of the log
     logged_steps = np.flatnonzero(is_logged[: len(time_s) - ekf2_output.lag_steps])
     is_fusing = is_fusing[logged_steps]
     is_gnss = model_inputs.aid == GNSS_POS

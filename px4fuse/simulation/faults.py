@@ -195,9 +195,9 @@ def format_fault(name: str, faults: FaultSizes) -> str:
     >>> format_fault("nlos", parse_faults(["nlos=5"]))
     'nlos=5%,2m'
     """
-    value_texts = [
-        f"{value:g}{_ASCII_UNITS.get(unit := BOUNDS_BY_FIELD[field_name].unit, unit)}"
-        for field_name in FAULT_TYPES[name].value_field_names
-        if (value := getattr(faults, field_name)) is not None
-    ]
+    value_texts = []
+    for field_name in FAULT_TYPES[name].value_field_names:
+        value, unit = getattr(faults, field_name), BOUNDS_BY_FIELD[field_name].unit
+        if value is not None:
+            value_texts.append(f"{value:g}{_ASCII_UNITS.get(unit, unit)}")
     return f"{name}={','.join(value_texts)}" if value_texts else name

@@ -45,12 +45,17 @@ def _sum_ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
     ``ramps`` are tuples of start (s), duration (s) and change. The function starts at zero.
     """
     start_s, duration_s, change = (np.array(values) for values in zip(*ramps, strict=True))
+    # Values between the ramps: 0 before the first ramp, then the sums of the changes
     value_after_ramp = np.concatenate([0.0 * change[:1], np.cumsum(change, axis=0)])
     end_s = start_s + duration_s
+    # Breakpoints: 1 s before the first ramp, start and end of each ramp, 1 s after the last ramp.
+    # The values there are v0, v0, v1, v1, v2, ...: each value is that at the end of a ramp and at
+    # the start of the next ramp
     times_s = np.r_[start_s[0] - 1.0, np.column_stack([start_s, end_s]).ravel(), end_s[-1] + 1.0]
     # If two ramps meet, keep only one of the two equal breakpoints
     is_used = np.diff(times_s, prepend=-np.inf) > MIN_POLYNOMIAL_BREAKPOINT_DISTANCE_S
     values = np.repeat(value_after_ramp, 2, axis=0)[is_used]
+    # With velocity and acceleration 0 at all breakpoints, the polynomials are quintic
     derivatives = np.stack([values, 0.0 * values, 0.0 * values], axis=1)
     return PPoly.from_bernstein_basis(BPoly.from_derivatives(times_s[is_used], derivatives))
 
@@ -85,6 +90,7 @@ class Sines:
 
     def compute_values(self, time_s: Array, array_count: int = 1) -> list[Array]:
         """Return the sum of the sines and its time derivatives: ``array_count`` arrays (t, k)."""
+        # Shapes for m sines: basis (t, 2m), with sin and cos of each angle; amplitudes (2m, k)
         angle = np.outer(time_s, self.angular_frequency_rad_s)
         basis = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
         amplitudes = [np.concatenate([self.sine, self.cosine])]
@@ -93,6 +99,7 @@ class Sines:
             # d/dt (s sin ωt + c cos ωt) = -ωc sin ωt + ωs cos ωt
             sine, cosine = np.split(amplitudes[-1], 2)
             amplitudes.append(np.concatenate([-omega * cosine, omega * sine]))
+        # One product for all derivatives: (t, 2m) · (2m, array_count · k)
         return np.split(basis @ np.hstack(amplitudes), array_count, axis=1)
 
 
@@ -182,7 +189,8 @@ def compute_attitude_and_imu(state: TrueState) -> AttitudeAndImu:
     specific_thrust_m_s2 = np.sqrt(
         _dot(negative_thrust_acceleration_m_s2, negative_thrust_acceleration_m_s2)
     )[:, None]
-    # the thrust is along -z; the derivative of the unit vector z is perpendicular to z
+    # The thrust is along -z, so z = a/|a| with a = gravity - acceleration, and da/dt = -jerk.
+    # dz/dt is da/dt / |a| without its component along z, because z keeps its length
     z = negative_thrust_acceleration_m_s2 / specific_thrust_m_s2
     z_derivative_per_s = -state.jerk_m_s3 / specific_thrust_m_s2
     z_derivative_per_s -= z * _dot(z, z_derivative_per_s)[:, None]
@@ -190,8 +198,8 @@ def compute_attitude_and_imu(state: TrueState) -> AttitudeAndImu:
         np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
         for angle in (state.yaw_rad, state.yaw_rad + np.pi / 2.0)
     )
-    # direction of the body's y axis, not normalised: z × forward direction. The forward direction
-    # turns to the right with the yaw rate
+    # y has the direction u = z × forward direction. The forward direction turns to the right with
+    # the yaw rate, so du/dt = dz/dt × forward direction + yaw rate · z × right direction
     unnormalised_y = np.cross(z, forward_direction)
     unnormalised_y_derivative_per_s = np.cross(
         z_derivative_per_s, forward_direction
@@ -200,7 +208,8 @@ def compute_attitude_and_imu(state: TrueState) -> AttitudeAndImu:
     y = unnormalised_y / unnormalised_y_length[:, None]
     x = np.cross(y, z)
     # Angular rate ω in body axes. A body axis e moves with de/dt = ω × e, so ω_x = -y · dz/dt,
-    # ω_y = x · dz/dt and ω_z = -x · dy/dt
+    # ω_y = x · dz/dt and ω_z = -x · dy/dt. Along x, dy/dt is du/dt / |u|, because x is
+    # perpendicular to u
     rate_rad_s = np.stack(
         [
             -_dot(z_derivative_per_s, y),
@@ -294,15 +303,17 @@ def _plan_aisle_passes(flight_plan: _FlightBuilder, scenario: Scenario, speed_m_
     velocity_m_s = speed_m_s * compute_direction(scenario.heading_deg)
     heading_follows_path = scenario.nose_follows_path and speed_m_s > 0.0
     pause_s = max(scenario.pause_s, TURN_ROUND_DURATION_S if heading_follows_path else 0.0)
-    # the first velocity ramp begins at this time, so its centre is half a ramp later
+    # ramp_centre_s is now the end of the pause. The first ramp starts then, so its centre is half a
+    # ramp later
     flight_plan.ramp_centre_s += SPEED_RAMP_DURATION_S / 2.0
     for pass_index in range(scenario.passes):
         pass_velocity_m_s = velocity_m_s if pass_index % 2 == 0 else -velocity_m_s
-        # without motion, the velocity is 0, but a pass lasts as long as at the speed of the
-        # scenario
+        # Time between the centres of start and stop. Not speed_m_s, because it is 0 without motion:
+        # the vehicle then hovers for the same time
         flight_plan.add_velocity_change(
             pass_velocity_m_s, SPEED_RAMP_DURATION_S, scenario.length_m / scenario.speed_m_s
         )
+        # The vehicle turns after the end of the ramp in which it stops
         stop_time_s = flight_plan.ramp_centre_s + SPEED_RAMP_DURATION_S / 2.0
         flight_plan.add_velocity_change(
             -pass_velocity_m_s, SPEED_RAMP_DURATION_S, SPEED_RAMP_DURATION_S + pause_s
@@ -321,11 +332,13 @@ def _plan_square_laps(
         )
     side_count = 4 * scenario.passes
     previous_velocity_m_s = np.zeros(3)
-    # the first velocity ramp begins at this time, so its centre is half a ramp later
+    # ramp_centre_s is now the end of the pause. The first ramp starts then, so its centre is half a
+    # ramp later
     flight_plan.ramp_centre_s += SPEED_RAMP_DURATION_S / 2.0
     for side_index in range(side_count):
         velocity_m_s = speed_m_s * compute_direction(scenario.heading_deg + 90.0 * side_index)
         ramp_duration_s = CORNER_DURATION_S if side_index else SPEED_RAMP_DURATION_S
+        # The vehicle turns by 90° during the velocity change of the corner
         if side_index and scenario.nose_follows_path and speed_m_s > 0.0:
             turn_start_s = flight_plan.ramp_centre_s - CORNER_DURATION_S / 2.0
             flight_plan.yaw_ramps.append((turn_start_s, CORNER_DURATION_S, np.array([np.pi / 2.0])))

@@ -296,6 +296,7 @@ def simulate_positions(
     scenario: Scenario, faults: FaultSizes, motion: Motion
 ) -> SimulatedPositions:
     """Simulate UWB (aisle), VIO (loop) or GNSS (outdoor) positions with injected faults."""
+    # 1. Times of measurement
     timing_rng = make_random_generator(scenario, RandomStream.POSITION_TIMES)
     interval_s = 1.0 / scenario.source_rate_hz
     position_count = int((motion.duration_s - FIRST_POSITION_TIME_S) / interval_s)
@@ -305,11 +306,12 @@ def simulate_positions(
         timing_rng.normal(0.0, INTERVAL_JITTER_FRACTION, position_count), -0.4, 0.4
     )
     time_s = np.maximum(nominal_times_s + jitter_fraction * interval_s, 0.0)
+    # 2. Measured positions: true position and errors
     state = motion.compute_true_state(time_s)
     speed_m_s = np.hypot(state.velocity_m_s[:, 0], state.velocity_m_s[:, 1])
     distance_m = integrate_cumulatively(speed_m_s, time_s)
     is_loop, is_outdoor = scenario.kind == "loop", scenario.kind == "outdoor"
-    drift_m = simulate_vio_drift(scenario, distance_m) * is_loop
+    drift_m = simulate_vio_drift(scenario, distance_m) * is_loop  # only VIO drifts
     sigma_m = scenario.source_sigma_m * (GNSS_SIGMA_FACTORS if is_outdoor else 1.0)
     noise_m = sigma_m * make_random_generator(
         scenario, RandomStream.POSITION_NOISE
@@ -319,6 +321,7 @@ def simulate_positions(
     position_m = state.position_m + drift_m + noise_m + outlier_offset_m
     position_m += simulate_correlated_noise(scenario, faults, len(time_s), interval_s)
     position_m = _apply_source_faults(position_m, time_s, scenario, faults, motion)
+    # 3. Positions that the source sends, and their timestamps
     is_logged = _is_outside_gap(
         time_s, faults.dropout_s, faults.dropout_at_s, motion.duration_s
     ) & is_kept_at_rate(time_s, faults.decimate_hz)
@@ -326,6 +329,7 @@ def simulate_positions(
     arrival_times_us, timestamp_us = (
         times_us[is_logged] for times_us in _simulate_position_times_us(faults, time_s, timing_rng)
     )
+    # 4. Topic
     reported_sigma_m = compute_reported_sigma_m(scenario, faults)
     velocity_m_s = None
     if is_outdoor:
@@ -336,6 +340,7 @@ def simulate_positions(
         )[is_logged]
         north_m, east_m, down_m = position_m.T
         latitude_deg, longitude_deg = unproject(north_m, east_m, HOME_POSITION[:2])
+        # The timestamp is GNSS_DELAY_S later than the measurement
         fields = make_timestamps(timestamp_us + round(1e6 * GNSS_DELAY_S)) | {
             "eph": reported_sigma_m,
             "epv": reported_sigma_m * GNSS_SIGMA_FACTORS[2],
@@ -368,7 +373,10 @@ def simulate_positions(
 def _apply_source_faults(
     position_m: Array, time_s: Array, scenario: Scenario, faults: FaultSizes, motion: Motion
 ) -> Array:
-    """Apply the faults of the source in their order: low-pass filter, scale, yaw, and jump."""
+    """Apply the faults of the source in their order: low-pass filter, scale, yaw, and jump.
+
+    The array ``position_m`` is changed. Use the returned array only.
+    """
     if faults.smoothed_s:
         decay_factor = np.exp(-1.0 / scenario.source_rate_hz / faults.smoothed_s)
         # with this initial state, the filter starts at the first position
@@ -382,6 +390,7 @@ def _apply_source_faults(
     position_m *= 1.0 + faults.scale_percent / 100.0
     if faults.yaw_deg:
         position_m = Rotation.from_euler("z", faults.yaw_deg, degrees=True).apply(position_m)
+    # Without this fault, jump_m is 0. By default, the jump is after two thirds of the flight
     jump_start_s = motion.duration_s / 1.5 if faults.jump_at_s is None else faults.jump_at_s
     position_m[time_s >= jump_start_s] += faults.jump_m * compute_direction(scenario.heading_deg)
     return position_m

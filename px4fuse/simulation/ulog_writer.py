@@ -43,18 +43,20 @@ def make_topic(name: str, field_values: Mapping[str, ArrayLike]) -> Topic:
         name, FIELD_DEFINITIONS_BY_TOPIC["estimator_aid_src"]
     )
     message_count, fields = np.size(field_values["timestamp"]), {}
+    # A line, for example "float32 nan 4: q", contains the type, the default value and the number of
+    # elements of an array (both optional), and the names of fields
     for line in ["uint64: timestamp timestamp_sample", *fields_text.splitlines()]:
         type_and_default, field_names = line.split(":")
-        # for example "float32 nan 4": type, default value, and number of elements of an array
         numpy_type, *default_and_shape = type_and_default.split()
         for field in field_names.split():
             if field in field_values:
                 values = np.asarray(field_values[field])
-                values = values if values.ndim else np.full(message_count, values)
+                if not values.ndim:
+                    values = np.full(message_count, values)
             elif default_and_shape:
                 default, *shape = default_and_shape
                 values = np.full([message_count, *map(int, shape)], float(default))
-            else:
+            else:  # not logged
                 continue
             fields[field] = values.astype(numpy_type)
     unknown_fields = field_values.keys() - fields.keys()
