@@ -298,8 +298,8 @@ def _check_options(
             raise SettingsError(f"`{name}`: {value!r} is not one of {', '.join(units)}.")
     if columns and ("" in columns or len({*columns}) < len(columns) or not 3 <= len(columns) <= 5):
         raise SettingsError(
-            f"{COLUMNS_OPTION}[,SIGMA]: {','.join(columns)!r} does not name three to five different "
-            "columns."
+            f"{COLUMNS_OPTION}[,SIGMA]: {','.join(columns)!r} does not name three to five "
+            "different columns."
         )
 
 
