@@ -223,6 +223,22 @@ def test_simulated_ekf2_holds_position_if_fusion_is_disabled(clean):
     assert "EKF2_EV_CTRL" in finding.message
 
 
+@pytest.mark.slow
+def test_unfused_innovation_is_estimated_minus_measured_position():
+    simulation = simulate(AISLE, parse_faults(["ekf2-off"]))
+    topics = {topic.name: topic.fields for topic in simulation.topics}
+    innovations, published = topics["estimator_aid_src_ev_pos"], topics["vehicle_local_position"]
+    assert not innovations["fused"].any()
+    for column, name in enumerate("xy"):
+        times_us = (each["timestamp_sample"].astype(float) for each in (innovations, published))
+        estimated_m = np.interp(*times_us, published[name])
+        difference_m = innovations["innovation"][:, column] - (
+            estimated_m - innovations["observation"][:, column]
+        )
+        # the published position is ahead of the fusion horizon
+        assert np.median(np.abs(difference_m)) < 0.05
+
+
 # --- the log
 
 

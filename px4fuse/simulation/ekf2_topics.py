@@ -13,7 +13,7 @@ from px4fuse.ekf2.filter_recursion import (
     SegmentRun,
 )
 from px4fuse.ekf2.inputs import ReplayInputs
-from px4fuse.ekf2.replay_segments import HORIZONTAL_POSITION, POSITION
+from px4fuse.ekf2.replay_segments import HORIZONTAL_POSITION
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid
 from px4fuse.readers.px4_ekf2 import MAG_3D_FUSION_BIT
 from px4fuse.readers.px4_positions import unproject
@@ -202,8 +202,8 @@ def _make_position_aid_topics(
         for values in (model_run.innovation, model_run.innovation_variance, model_run.noise)
     )
     # If EKF2 does not test a position against the innovation gate, it still logs an innovation:
-    # measured minus estimated position
-    estimated_m = ekf2_output.states_at_fusion_horizon[logged_steps][:, POSITION][:, :2]
+    # measured minus estimated position. The states are the velocity (3 columns), then the position
+    estimated_m = ekf2_output.states_at_fusion_horizon[logged_steps, 3:5]
     # row 0 of the variances is before the first event, so the row after event i is i + 1
     estimate_variance = model_run.variance[logged_indices + 1, 0, HORIZONTAL_POSITION]
     position_noise_variance = noise_variance[:, HORIZONTAL_POSITION_COLUMNS]
