@@ -461,6 +461,8 @@ def test_overconfident_ekf2_without_replay_gets_noise_advice(
         (0.06, "uwb", 0.0,
          ("ekf2_noise_too_small", "warning", "EKF2_EVP_NOISE is 1.67 times too small")),
         (0.5, "uwb", 0.0, ("ekf2_noise_too_large", "error", "EKF2_EVP_NOISE is 5 times too large")),
+        # a too large noise does not cause rejections
+        (0.5, "uwb", 0.2, ("ekf2_noise_too_large", "error", "EKF2_EVP_NOISE is 5 times too large")),
         # PX4's default: not chosen, so the title names the sensor
         (0.1, "uwb", 0.0,
          ("ekf2_noise_too_small", "error", "UWB noise is 4 times the noise setting of EKF2")),

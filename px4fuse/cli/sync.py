@@ -49,5 +49,6 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
         )
     results = make_sync_results(request, comparison, time_offset)
     page = Page()
+    page.write(comparison.flight.log.name, bold=True)
     page.write_labelled_texts(advice)
     write_and_print_results(make_result_files(results, json_path), page, request)

@@ -89,7 +89,7 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
     else:
         title = f"{name} is {format_factor(factor)} times too {size_word}"
     rejected_fraction = analysis.main.rejected_fraction or 0.0
-    if rejected_fraction >= MIN_REJECTED_FRACTION_IN_MESSAGE:
+    if is_too_small and rejected_fraction >= MIN_REJECTED_FRACTION_IN_MESSAGE:
         title += f": EKF2 rejects {format_percent(rejected_fraction)} of the positions"
         reason = f"EKF2 rejects normal {sensor_name} noise as outliers."
     else:

@@ -21,6 +21,7 @@ def make_tuning_page(
 ) -> Page:
     """Make a page on the estimates of SIGMA_A and SIGMA_Z along each axis."""
     page = Page()
+    page.write(comparison.flight.log.name, bold=True)
     for name, tuning in tunings.items():
         axis_name = name.replace(AISLE_AXIS, "axis of largest motion")
         if isinstance(tuning, Unavailable):
