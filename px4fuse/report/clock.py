@@ -43,9 +43,7 @@ def summarise_offset(analysis: Analysis, findings: Iterable[Finding]) -> str:
     advice_by_label = make_time_offset_advice(
         analysis, analysis.time_offset, find_offset_rerun(analysis)
     )
-    return " ".join(
-        advice_by_label[label] for label in ("Result", "Offset") if label in advice_by_label
-    )
+    return f"{advice_by_label.get('Result', '')} {advice_by_label['Offset']}".lstrip()
 
 
 def has_time_offset_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
@@ -77,6 +75,7 @@ def make_time_offset_advice(
         }
     offset_s, (low_offset_s, high_offset_s) = time_offset.offset_s, time_offset.interval_s
     offset_text = f"{offset_s:+.3f} s (95 % {low_offset_s:+.3f} to {high_offset_s:+.3f} s)"
+    # If ground truth refutes the offset, both re-runs have a position RMSE
     if rerun is not None and truth_refutes_offset(rerun):
         return {
             "Result": (
@@ -88,6 +87,8 @@ def make_time_offset_advice(
             "Offset": f"The estimated time offset is {offset_text}.",
             "Action": "Check the timestamps of the ground truth, not of the positions.",
         }
+    # "Result" and "Offset" are always present, "Re-run" only for a significant offset. The other
+    # labels are independent of the result
     advice_by_label = {
         "Result": "The position source has no significant time offset.",
         "Offset": f"The estimated time offset is {offset_text}.",
