@@ -353,6 +353,7 @@ def evaluate(
         reference_position_m=matched_reference.position_m,
         position_error_m=position_error_m,
         notes=(*estimate_notes, *reference_notes, *notes),
+        # ``warnings``: frozen poses, jumps, uncertain alignment, and ground truth as estimate
         warnings=(
             *warnings,
             *_find_mirror_warnings(

@@ -421,5 +421,5 @@ def _refine_offset(
     shifts_s = half_width_s * np.linspace(-1.0, 1.0, 21)
     best_index = int(np.argmin([compute_cost(shift_s) for shift_s in shifts_s]))
     neighbours = np.clip([best_index - 1, best_index + 1], 0, len(shifts_s) - 1)
-    shift_bounds_s = shifts_s[neighbours]
-    return make_fit(float(minimize_scalar(compute_cost, bounds=shift_bounds_s, method="bounded").x))
+    optimum = minimize_scalar(compute_cost, bounds=shifts_s[neighbours], method="bounded")
+    return make_fit(float(optimum.x))
