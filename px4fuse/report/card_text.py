@@ -349,7 +349,9 @@ def make_rerun_rows(reruns: Sequence[CardRerun]) -> list[list[str]]:
             "position RMSE": _format_before_after(rerun.position_rmse_m, format_metres, " m"),
             "● innovation ÷ √S": _format_before_after(rerun.source_ratio, format_ratio),
             "◆ error ÷ σ": _format_before_after(rerun.truth_ratio, format_ratio),
-            "rejected": _format_before_after(rerun.rejected_fraction, _format_percent, " %"),
+            "rejected": _format_before_after(
+                rerun.rejected_fraction, lambda fraction: f"{100.0 * fraction:.0f}", " %"
+            ),
             "result": f"improves {rerun.improves.removesuffix(' only')}"
             if rerun.improves != "nothing"
             else "no improvement",
@@ -380,10 +382,6 @@ def _format_before_after(
     unit: str = "",
 ) -> str:
     return " → ".join(map(format_value, values)) + unit if values else ""
-
-
-def _format_percent(fraction: float) -> str:
-    return f"{100.0 * fraction:.0f}"
 
 
 def _format_verdict_lines(card: DiagnosisCard) -> Iterator[Paragraph]:

@@ -22,14 +22,10 @@ def find_font(character: str) -> str | None:
     """Return the name of an installed font with a character, or None."""
     if ord(character) in _read_font_characters(font_manager.findfont(FONT)):
         return FONT
-    return next(
-        (
-            name
-            for name, path in _list_fonts_except_dejavu()
-            if ord(character) in _read_font_characters(path)
-        ),
-        None,
-    )
+    for name, path in _list_fonts_except_dejavu():
+        if ord(character) in _read_font_characters(path):
+            return name
+    return None
 
 
 def find_font_names(text: str) -> list[str]:
