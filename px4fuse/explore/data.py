@@ -92,7 +92,12 @@ def make_flight_data(analysis: Analysis, encoder: ArrayEncoder) -> PageData:
             axis_inputs | _make_axis_data(analysis, result, encoder)
             for axis_inputs, result in zip(inputs["axes"], analysis.axes.values(), strict=True)
         ],
-        "likely": _collect_estimated_noises(analysis),
+        # SIGMA_A and SIGMA_Z by axis
+        "likely": {
+            name: [axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value]
+            for name, axis_tuning in analysis.tuning.items()
+            if isinstance(axis_tuning, AxisTuning)
+        },
         "likely_offset": _find_estimated_offset(analysis),
         "gaps": analysis.events.gaps,
         "command": _make_command(request, analysis),
@@ -129,14 +134,14 @@ def _make_imu_data(comparison: Comparison, encoder: ArrayEncoder) -> PageData | 
     time_s = acceleration.time_s
     gap_start_indices = np.flatnonzero(find_imu_gaps(time_s))
     gap_bounds_s = np.stack([time_s[gap_start_indices], time_s[gap_start_indices + 1]], 1)
-    # a row of differences contains 0 for the start of a gap, and the duration (s) of the gap for
-    # its end
-    cumulative_gap_duration_s = np.cumsum(np.diff(gap_bounds_s, prepend=gap_bounds_s[:, :1]))
+    # Total duration (s) before the first gap, and after each gap
+    total_gap_duration_s = np.append(0.0, np.cumsum(np.diff(gap_bounds_s)))
     return {
         "time": encoder.add_times(time_s),
         "gapEdges": gap_bounds_s.ravel().tolist(),
-        # total duration (s) of all gaps up to each start and each end of a gap
-        "gapSum": cumulative_gap_duration_s.tolist(),
+        # Total duration at the start and at the end of each gap: each total applies from the end of
+        # a gap to the start of the next gap
+        "gapSum": np.repeat(total_gap_duration_s, 2)[1:-1].tolist(),
     }
 
 
@@ -246,14 +251,6 @@ def _pack_series(
         encoder.add(np.asarray(column), DRAWN_VALUE_ROUNDING_STEPS_PER_UNIT) for column in columns
     ]
     return [encoder.add_times(np.asarray(time_s)), *values]
-
-
-def _collect_estimated_noises(analysis: Analysis) -> PageData:
-    return {
-        name: [axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value]
-        for name, axis_tuning in analysis.tuning.items()
-        if isinstance(axis_tuning, AxisTuning)
-    }
 
 
 def _format_ekf2_settings(analysis: Analysis) -> dict[str, str]:

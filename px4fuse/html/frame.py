@@ -133,22 +133,18 @@ def _omit_empty(sections: Sequence[RowDetailsSection]) -> list[RowDetailsSection
 
 def page(
     *,
-    title: str,
-    subtitle: str,
-    html_above_table: str = "",
-    rows_name: str,
     columns: Sequence[Column],
     rows: Sequence[Row],
-    filters: Sequence[tuple[str, Sequence[tuple[str, str]]]],
-    column_groups: Sequence[tuple[str, str]] = (),
-    search_placeholder: str,
-    full_table_note: str,
     sigma_ratio_axis: Mapping[str, Any] | None = None,
+    **fields: object,
 ) -> str:
     """Make a web page with a table that can be sorted, searched and filtered.
 
     Parameters
     ----------
+    sigma_ratio_axis : mapping, optional
+        Axis of the columns with σ ratios: range, shaded bands and marks.
+    title, subtitle, html_above_table : str
     rows_name : str
         Name of the rows (plural).
     filters : sequence of (label, ((tag, text), ...))
@@ -159,8 +155,9 @@ def page(
         Hint in the search field.
     full_table_note : str
         Sentence about the file with all rows.
-    sigma_ratio_axis : mapping, optional
-        Axis of the columns with σ ratios: range, shaded bands and marks.
+
+    The last eight are fields of the template ``frame.html``, which raises an error if one is
+    missing.
     """
     css_text = "".join(map(read_asset, ("colours.css", "base.css", "frame.css")))
     script = "".join(map(read_asset, ("dom.js", "frame.js")))
@@ -178,13 +175,6 @@ def page(
         script_hash=compute_csp_hash(script),
         style=css_text,
         script=script,
-        title=title,
-        subtitle=subtitle,
-        above=html_above_table,
-        placeholder=search_placeholder,
-        filters=filters,
-        groups=column_groups,
-        rows_name=rows_name,
-        full_table_note=full_table_note,
         content=encode_safe_json(clean_texts(page_data)),
+        **fields,
     )

@@ -1,8 +1,10 @@
 """Loop closure error of a trajectory, and corrected paths with ATE and RPE."""
 
+import math
 from contextlib import suppress
 
 import numpy as np
+from msgspec import structs
 
 from px4fuse.comparison.estimates import Progress, ignore_progress
 from px4fuse.core.arrays import Array, IntArray
@@ -11,7 +13,6 @@ from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
 from px4fuse.request import GivenClosure, LoopRequest
-from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import (
     Trajectory,
     compute_extent_m,
@@ -70,39 +71,36 @@ def analyse(
     _require_in_range("heading_drift_deg", noise.heading_deg, 1e-4)
     trajectory, flight = source.trajectory, source.flight
     is_assessed = flight is not None and bool(flight.log.is_assessed)
-    time_origin_s = float(trajectory.time_s[0]) if trajectory.unix_offset_s == 0.0 else 0.0
-
-    def convert_to_trajectory_time_s(time_s: float) -> float:
-        return time_s + time_origin_s if abs(time_s) < MIN_UNIX_TIME_S else time_s
-
     start_s, end_s = (
-        None if time_s is None else convert_to_trajectory_time_s(time_s)
+        None if time_s is None else _convert_option_time_s(trajectory, time_s)
         for time_s in (request.start_s, request.end_s)
     )
     segment = loop_segment.choose_loop_segment(flight, trajectory, start_s, end_s)
+    # 1. True final pose, and loop closures
     truth = None
     if flight is not None and trajectory.kind != "truth":
         with suppress(MissingDataError):
             truth = trajectory_of(flight, "truth")
     z_down_trajectory = to_z_down(trajectory)
     path = loop_segment.cut_trajectory(z_down_trajectory, segment)
-    final_pose_in_truth = None
+    # Final pose, or the reason (text) why ground truth does not contain it
+    final_pose_in_truth: TrueFinalPose | str | None = None
     if truth and request.closed_loop and request.landed_at is None:
         final_pose_in_truth = loop_segment.find_final_pose_in_truth(path, truth, segment)
     true_end = _find_true_end(path, request, final_pose_in_truth, segment, is_assessed=is_assessed)
-    closures = [
-        GivenClosure(
-            convert_to_trajectory_time_s(closure.time_1_s),
-            convert_to_trajectory_time_s(closure.time_2_s),
-            closure.sigma_m,
-        )
-        for closure in request.closures
-    ]
-    for closure in closures:
-        _require_valid_closure(closure, path)
+    closures = []
     if not isinstance(true_end, Unavailable):
         # The closure between take-off and landing is the first
-        closures.insert(0, GivenClosure(segment.start_s, segment.end_s, true_end.sigma_m))
+        closures.append(GivenClosure(segment.start_s, segment.end_s, true_end.sigma_m))
+    for given_closure in request.closures:
+        closure = structs.replace(
+            given_closure,
+            time_1_s=_convert_option_time_s(trajectory, given_closure.time_1_s),
+            time_2_s=_convert_option_time_s(trajectory, given_closure.time_2_s),
+        )
+        _require_valid_closure(closure, path)
+        closures.append(closure)
+    # 2. Pose graph with the key frames as nodes, and its solutions
     key_frame_spacing_m = request.key_frames_m
     if key_frame_spacing_m is None:
         key_frame_spacing_m = compute_default_key_frame_spacing_m(path.position_m)
@@ -116,6 +114,7 @@ def analyse(
     pose_graph_corrections, tested_closures = solve_pose_graphs(
         path, node_indices, graph, closures, true_end, progress
     )
+    # 3. Closure errors, and their distribution along the path
     displacement_m = path.position_m[-1] - path.position_m[0]
     odometry_heading_change_deg = loop_segment.compute_heading_change_deg(path)
     closure_error_vector_m: Array | Unavailable
@@ -131,6 +130,7 @@ def analyse(
     paths_with_distributed_closure_error = distribute_closure_error_by_distance(
         path, distance_m, closure_error_vector_m, heading_error_deg, tested_closures
     )
+    # 4. ATE and RPE of all paths
     references = tuple(track for track in (truth, reference) if track is not None)
     return Loop(
         track=path.name,
@@ -163,6 +163,17 @@ def analyse(
         original_frame=trajectory.frame,
         is_assessed=is_assessed,
     )
+
+
+def _convert_option_time_s(trajectory: Trajectory, time_s: float) -> float:
+    """Convert a time (s) from an option to the clock of a trajectory.
+
+    If the times of the trajectory are UNIX times, small times are relative to its first pose.
+    """
+    has_unix_times = trajectory.unix_offset_s == 0.0
+    if has_unix_times and abs(time_s) < MIN_UNIX_TIME_S:
+        return time_s + float(trajectory.time_s[0])
+    return time_s
 
 
 def _find_true_end(
@@ -217,7 +228,10 @@ def _choose_key_frames(path: Trajectory, key_frame_spacing_m: float) -> tuple[In
     _require_in_range("key_frames_m", key_frame_spacing_m, 1e-3)
     key_frame_indices = choose_key_frames(path.position_m, key_frame_spacing_m)
     distance_m = cumulative_distance(path.position_m[key_frame_indices])
-    if not distance_m[-1] >= max(MIN_PATH_LENGTH_M * min(1.0, key_frame_spacing_m / 0.5), 1e-6):
+    # Small key frame spacings are for small paths: below 0.5 m, the minimum length is proportional
+    # to the spacing. The lower limit excludes a path without motion
+    min_length_m = max(MIN_PATH_LENGTH_M * min(1.0, key_frame_spacing_m / 0.5), 1e-6)
+    if not distance_m[-1] >= min_length_m:  # also if the length is not a number (NaN)
         raise TrajectoryError(
             f"{path.name}: the path of {distance_m[-1]:.2f} m is too short for key frames every "
             f"{key_frame_spacing_m:g} m",
@@ -264,7 +278,7 @@ def _compute_heading_error(
             "unknown",
             "Give the true heading change in flight: px4fuse loop --landed-at FORWARD,RIGHT,DEG.",
         )
-    return float(np.degrees(lie.wrap(np.radians(heading_change_deg - true_end.heading_change_deg))))
+    return math.remainder(heading_change_deg - true_end.heading_change_deg, 360.0)
 
 
 def analyse_flight_loop(

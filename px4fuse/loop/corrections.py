@@ -12,7 +12,6 @@ from px4fuse.errors import Px4FuseError
 from px4fuse.flight.model import Unavailable
 from px4fuse.request import GivenClosure
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
-from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.covariance import gate_edges
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import ROBUST_SOLUTION_LABEL, Solution, solve
@@ -169,50 +168,42 @@ def build_pose_graph(
         path, node_indices, noise
     )
     # Edges of the pose graph: odometry between successive nodes, then loop closures
-    step_indices = np.arange(len(node_indices) - 1)
-    first_nodes = np.append(step_indices, closure_nodes[:, 0])
-    second_nodes = np.append(step_indices + 1, closure_nodes[:, 1])
-    information = np.zeros((len(first_nodes), 6, 6))
-    information_diagonal = np.column_stack(
-        [np.repeat(1.0 / translation_variance_m2[:, None], 3, axis=1), 1.0 / rotation_variance_rad2]
-    )
-    information[step_indices[:, None], range(6), range(6)] = information_diagonal
+    step_count = len(node_indices) - 1
+    first_nodes = np.append(np.arange(step_count), closure_nodes[:, 0])
+    second_nodes = np.append(np.arange(step_count) + 1, closure_nodes[:, 1])
+    # Each edge measures the pose of its second node in the axes of its first node
     first_rotation_inverse = node_rotation[first_nodes].inv()
-    second_node_rotation = node_rotation[second_nodes]
     measured_translation_m = first_rotation_inverse.apply(
         node_position_m[second_nodes] - node_position_m[first_nodes]
     )
+    measured_rotation = first_rotation_inverse * node_rotation[second_nodes]
+    information_diagonal = np.column_stack(
+        [np.repeat(1.0 / translation_variance_m2[:, None], 3, axis=1), 1.0 / rotation_variance_rad2]
+    )
+    information = np.zeros((len(first_nodes), 6, 6))
+    information[:step_count] = np.eye(6) * information_diagonal[:, None]
     # A loop closure states that its two poses have the same position; it gives no information on
     # their orientations
-    landing_edge_index = len(step_indices)
-    for edge_index, closure in enumerate(closures, start=landing_edge_index):
+    landing_edge = step_count
+    for edge_index, closure in enumerate(closures, start=landing_edge):
         measured_translation_m[edge_index] = 0.0
-        information[edge_index, range(3), range(3)] = closure.sigma_m**-2
+        information[edge_index, :3, :3] = np.eye(3) * closure.sigma_m**-2
     if not isinstance(true_end, Unavailable):
-        measured_translation_m[landing_edge_index] = first_rotation_inverse[
-            landing_edge_index
-        ].apply(true_end.displacement_vector_m)
+        measured_translation_m[landing_edge] = first_rotation_inverse[landing_edge].apply(
+            true_end.displacement_vector_m
+        )
         if true_end.heading_change_deg is not None:
-            # Rotate the measured final orientation about the vertical, so that the edge from the
-            # first to the final pose has the true heading change
-            odometry_heading_change_rad = compute_heading_change_rad(
-                second_node_rotation[landing_edge_index]
-                * node_rotation[first_nodes[landing_edge_index]].inv()
+            final_rotation = _set_heading_change(
+                node_rotation[first_nodes[landing_edge]],
+                node_rotation[second_nodes[landing_edge]],
+                true_end.heading_change_deg,
             )
-            heading_correction_rad = float(
-                lie.wrap(np.radians(true_end.heading_change_deg) - odometry_heading_change_rad)
-            )
-            second_node_rotation[landing_edge_index] = (
-                Rotation.from_rotvec(heading_correction_rad * DOWN_DIRECTION)
-                * second_node_rotation[landing_edge_index]
-            )
-            # The true final pose determines only the rotation about the vertical. The edge needs
-            # this axis in the frame of the final pose
-            vertical_direction = (
-                second_node_rotation[landing_edge_index].inv().apply(DOWN_DIRECTION)
-            )
+            measured_rotation[landing_edge] = first_rotation_inverse[landing_edge] * final_rotation
+            # Only the rotation about the vertical v (in the axes of the final pose) is known, with
+            # its σ. The information matrix is v vᵀ / σ²
+            vertical_direction = final_rotation.inv().apply(DOWN_DIRECTION)
             heading_sigma_rad = np.radians(true_end.sigma_heading_deg or 0.0)
-            information[landing_edge_index, 3:, 3:] = (
+            information[landing_edge, 3:, 3:] = (
                 np.outer(vertical_direction, vertical_direction) / heading_sigma_rad**2
             )
     graph = PoseGraph(
@@ -221,13 +212,22 @@ def build_pose_graph(
         poses=np.column_stack([node_position_m, node_rotation.as_quat()]),
         first_nodes=first_nodes,
         second_nodes=second_nodes,
-        measurements=np.column_stack(
-            [measured_translation_m, (first_rotation_inverse * second_node_rotation).as_quat()]
-        ),
+        measurements=np.column_stack([measured_translation_m, measured_rotation.as_quat()]),
         information=information,
         initial_pose_origin="odometry",
     )
     return graph, node_indices, variance_note
+
+
+def _set_heading_change(
+    initial_rotation: Rotation, final_rotation: Rotation, heading_change_deg: float
+) -> Rotation:
+    """Rotate the final orientation about the vertical to a given heading change."""
+    odometry_heading_change_rad = compute_heading_change_rad(
+        final_rotation * initial_rotation.inv()
+    )
+    correction_rad = np.radians(heading_change_deg) - odometry_heading_change_rad
+    return Rotation.from_rotvec(correction_rad * DOWN_DIRECTION) * final_rotation
 
 
 # Labels of the corrected paths, by their key in results.json
@@ -254,11 +254,11 @@ def distribute_closure_error_by_distance(
 
     Return a path with corrected positions, and a path with corrected positions and headings.
     """
-    for closure in closures:
-        if closure.source == LANDING_CLOSURE_SOURCE and not closure.accepted:
-            closure_error_vector_m = _explain_gate_rejection(
-                "path correction in proportion to path length", closure
-            )
+    # The closure between take-off and landing, if any, is the first
+    if closures and closures[0].source == LANDING_CLOSURE_SOURCE and not closures[0].accepted:
+        closure_error_vector_m = _explain_gate_rejection(
+            "path correction in proportion to distance flown", closures[0]
+        )
     if isinstance(closure_error_vector_m, Unavailable):
         return {"by_distance_plain": closure_error_vector_m, "by_distance": closure_error_vector_m}
     position_m = distribute_by_distance(path.position_m, closure_error_vector_m, distance_m)
@@ -346,7 +346,8 @@ def solve_pose_graphs(
     else:
         progress(f"optimising: {CORRECTION_LABELS['pose_graph_gated']}")
         solution = solve(graph.select_edges(is_used))
-        corrections["pose_graph_gated"] = _correct_path(path, node_indices, graph.poses, solution)
+        corrected_path = _correct_path(path, node_indices, graph.poses, solution.poses)
+        corrections["pose_graph_gated"] = corrected_path, solution
     if len(closures) < 2:
         corrections["pose_graph_gnc"] = Unavailable(
             ROBUST_SOLUTION_LABEL,
@@ -356,7 +357,8 @@ def solve_pose_graphs(
     else:
         progress(f"optimising: {ROBUST_SOLUTION_LABEL}")
         solution = solve(graph, robust=True, is_closure=is_closure)
-        corrections["pose_graph_gnc"] = _correct_path(path, node_indices, graph.poses, solution)
+        corrected_path = _correct_path(path, node_indices, graph.poses, solution.poses)
+        corrections["pose_graph_gnc"] = corrected_path, solution
         closures = tuple(
             structs.replace(closure, weight_gnc=weight)
             for closure, weight in zip(closures, solution.weights[is_closure].tolist(), strict=True)
@@ -365,13 +367,9 @@ def solve_pose_graphs(
 
 
 def _correct_path(
-    path: Trajectory, node_indices: IntArray, graph_poses: Array, solution: Solution
-) -> tuple[Trajectory, Solution]:
-    """Correct each pose of a path by interpolation of the corrections of the graph nodes.
-
-    Return the corrected path with its solution.
-    """
-    solved_poses = solution.poses
+    path: Trajectory, node_indices: IntArray, graph_poses: Array, solved_poses: Array
+) -> Trajectory:
+    """Correct each pose of a path by interpolation of the corrections of the graph nodes."""
     node_corrections = (
         Rotation.from_quat(solved_poses[:, 3:]) * Rotation.from_quat(graph_poses[:, 3:]).inv()
     )
@@ -389,7 +387,7 @@ def _correct_path(
     position_m = (1.0 - next_node_weight[:, None]) * position_corrected_by_previous_node_m
     position_m += next_node_weight[:, None] * position_corrected_by_next_node_m
     rotation = Slerp(node_time_s, node_corrections)(time_s)
-    return path.replace_positions(position_m, rotation), solution
+    return path.replace_positions(position_m, rotation)
 
 
 def score_paths(
@@ -398,46 +396,60 @@ def score_paths(
     references: tuple[Trajectory, ...],
 ) -> dict[CorrectionName, PathResult | Unavailable]:
     """Compute ATE and RPE of the uncorrected path and of all corrected paths."""
-    # The time offset from the reference is estimated with the uncorrected path, which is scored
-    # first. All corrected paths have the same times, so they use the same offset
-    time_offset_by_reference_s: dict[str, float] = {}
-
-    def evaluate_path(path: Trajectory, reference: Trajectory) -> Evaluation | Unavailable:
-        default_offset_s = 0.0 if reference.sha256 == path.sha256 else None
-        offset_s = time_offset_by_reference_s.get(reference.name, default_offset_s)
-        try:
-            return evaluate(path, reference, time_offset_s=offset_s)
-        except Px4FuseError as error:
-            return Unavailable(
-                f"ATE and RPE against {reference.name}",
-                str(error),
-                "Give another reference trajectory with --reference.",
-            )
-
-    def score_path(name: CorrectionName, path: Trajectory, solution: Solution | None) -> PathResult:
-        displacement_m: Array = np.linalg.norm(path.position_m - odometry.position_m, axis=1)
-        solution_fields = {
-            field_name: getattr(solution, field_name, None)
-            for field_name in ("cost_initial", "cost", "iterations", "converged")
+    # Time offsets of the references. None: the evaluation chooses the offset. Tracks of the same
+    # log have the same clock
+    time_offsets_s = {
+        reference.name: 0.0 if reference.sha256 == odometry.sha256 else None
+        for reference in references
+    }
+    outcomes: dict[CorrectionName, CorrectionOutcome] = {
+        "uncorrected": (odometry, None),
+        **corrected_paths,
+    }
+    scored_paths: dict[CorrectionName, PathResult | Unavailable] = {}
+    for name, outcome in outcomes.items():
+        if isinstance(outcome, Unavailable):
+            scored_paths[name] = outcome
+            continue
+        path, solution = outcome
+        scores = {
+            reference.name: _evaluate_path(path, reference, time_offsets_s[reference.name])
+            for reference in references
         }
-        return PathResult(
+        if path is odometry:
+            # All corrected paths have the same times, so they use the offsets of the odometry
+            for reference_name, score in scores.items():
+                if isinstance(score, Evaluation) and score.time_offset.offset_s is not None:
+                    time_offsets_s[reference_name] = score.time_offset.offset_s
+        correction_m: Array = np.linalg.norm(path.position_m - odometry.position_m, axis=1)
+        result = PathResult(
             name=CORRECTION_LABELS[name],
             trajectory=path,
-            correction_max_m=float(displacement_m.max()),
-            correction_rms_m=rms(displacement_m),
-            scores={reference.name: evaluate_path(path, reference) for reference in references},
+            correction_max_m=float(correction_m.max()),
+            correction_rms_m=rms(correction_m),
+            scores=scores,
             solution=solution,
-            **solution_fields,
         )
-
-    uncorrected_path = score_path("uncorrected", odometry, None)
-    for name, evaluation in uncorrected_path.scores.items():
-        if isinstance(evaluation, Evaluation) and evaluation.time_offset.offset_s is not None:
-            time_offset_by_reference_s[name] = evaluation.time_offset.offset_s
-    scored_paths: dict[CorrectionName, PathResult | Unavailable] = {"uncorrected": uncorrected_path}
-    for name, corrected_path in corrected_paths.items():
-        if isinstance(corrected_path, Unavailable):
-            scored_paths[name] = corrected_path
-        else:
-            scored_paths[name] = score_path(name, *corrected_path)
+        if solution is not None:
+            result = structs.replace(
+                result,
+                cost_initial=solution.cost_initial,
+                cost=solution.cost,
+                iterations=solution.iterations,
+                converged=solution.converged,
+            )
+        scored_paths[name] = result
     return scored_paths
+
+
+def _evaluate_path(
+    path: Trajectory, reference: Trajectory, time_offset_s: float | None
+) -> Evaluation | Unavailable:
+    try:
+        return evaluate(path, reference, time_offset_s=time_offset_s)
+    except Px4FuseError as error:
+        return Unavailable(
+            f"ATE and RPE against {reference.name}",
+            str(error),
+            "Give another reference trajectory with --reference.",
+        )

@@ -19,7 +19,6 @@ from px4fuse.flight.model import (
     AXIS_NAMES,
     DIAGNOSIS_WITHHELD,
     Columns,
-    Ekf2,
     Flight,
     PositionTrack,
     Truth,
@@ -70,7 +69,11 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
         return _make_kf_trajectory(flight)
     truth = DIAGNOSIS_WITHHELD if flight.log.is_assessed else flight.truth
     track_data = {"vio": find_odometry(flight), "truth": truth, "ekf2": flight.ekf2}[track_name]
-    if isinstance(track_data, PositionTrack):
+    if isinstance(track_data, Unavailable):
+        raise MissingDataError(
+            f"{flight.log.name}:{track_name}: {track_data.reason}", track_data.remedy
+        )
+    if isinstance(track_data, PositionTrack):  # odometry
         # Without a frame in the log, x is assumed to be forward at the start (FRD)
         frame: Frame = "NED" if track_data.frame == "NED" else "FRD"
         note = f"{track_data.name}: {track_data.description}"
@@ -81,17 +84,15 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
         return _make_trajectory(
             flight, track_name, track_data.samples, track_data.attitude, (track_data.name,)
         )
-    if not isinstance(track_data, Ekf2):
-        raise MissingDataError(
-            f"{flight.log.name}:{track_name}: {track_data.reason}", track_data.remedy
-        )
+    # EKF2
     state = track_data.state
     notes = ["EKF2 position as published by PX4"]
-    source = next((t for t in flight.positions if t.origin.is_vision), None)
-    if source is not None:
+    vision_tracks = [track for track in flight.positions if track.origin.is_vision]
+    if vision_tracks:
         segment = Segment(0.0, flight.log.duration_s, "")
-        state, resets = remove_origin_resets(track_data, source, segment)
-        notes += [resets] if resets else []
+        state, reset_note = remove_origin_resets(track_data, vision_tracks[0], segment)
+        if reset_note:
+            notes.append(reset_note)
     return _make_trajectory(flight, track_name, state, flight.attitude, tuple(notes))
 
 

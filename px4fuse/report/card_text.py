@@ -125,10 +125,10 @@ def format_card_lines(card: DiagnosisCard) -> Iterator[Paragraph]:
     yield from _format_identity_lines(card)
     yield make_headline(card)
     yield _make_labelled_paragraph("effect", card.effect_text)
-    for label, text in zip(("action", "", ""), card.do_this, strict=False):
-        yield _make_labelled_paragraph(label, text)
+    for index, text in enumerate(card.do_this):
+        yield _make_labelled_paragraph("" if index else "action", text)
     for number, cause in enumerate(card.causes, start=1):
-        if number > 1:
+        if number > 1:  # the headline contains the title of the first cause
             title = f"{cause.severity}[{cause.id}]: {cause.title}"
             yield Paragraph(title, style=SEVERITY_STYLES[cause.severity])
         label = f"cause {number}" if len(card.causes) > 1 else "cause"
@@ -248,6 +248,7 @@ def locate_sigma_ratio(
     fraction = map_ratio_to_axis(ratio)
     return {
         "fraction": fraction,
+        # Name of the symbol: of the reference, or of an arrow for a ratio outside the axis
         "mark": "below" if fraction < 0.0 else "above" if fraction > 1.0 else reference,
         "band": [map_ratio_to_axis(end) for end in CONSISTENT_SIGMA_RATIOS[reference]],
         "interval": [
@@ -291,6 +292,8 @@ def _format_cause_lines(cause: DiagnosedCause, do_this: str) -> Iterator[Paragra
     is_shortened = len(cause.spans_s) > MAX_LISTED_SPANS
     times_text = " (all times: spans_s in the JSON results)" * is_shortened
     yield _make_labelled_paragraph("when", format_spans(cause.spans_s) + times_text)
+    # An action without alternatives and commands is omitted if ``do_this`` (above the causes)
+    # contains its sentence. There, the first letter can be lowercase, so it is not compared
     actions = [
         (label, action)
         for label, action in label_alternatives(cause)
@@ -344,7 +347,9 @@ def make_rerun_rows(reruns: Sequence[CardRerun]) -> list[list[str]]:
             "position RMSE": _format_before_after(rerun.position_rmse_m, format_metres, " m"),
             "● innovation ÷ √S": _format_before_after(rerun.source_ratio, format_ratio),
             "◆ error ÷ σ": _format_before_after(rerun.truth_ratio, format_ratio),
-            "rejected": _format_before_after(rerun.rejected_fraction, _format_percent, " %"),
+            "rejected": _format_before_after(
+                rerun.rejected_fraction, lambda fraction: f"{100.0 * fraction:.0f}", " %"
+            ),
             "result": f"improves {rerun.improves.removesuffix(' only')}"
             if rerun.improves != "nothing"
             else "no improvement",
@@ -375,10 +380,6 @@ def _format_before_after(
     unit: str = "",
 ) -> str:
     return " → ".join(map(format_value, values)) + unit if values else ""
-
-
-def _format_percent(fraction: float) -> str:
-    return f"{100.0 * fraction:.0f}"
 
 
 def _format_verdict_lines(card: DiagnosisCard) -> Iterator[Paragraph]:

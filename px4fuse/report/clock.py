@@ -45,9 +45,7 @@ def summarise_offset(analysis: Analysis, findings: Iterable[Finding]) -> str:
     advice_by_label = make_time_offset_advice(
         analysis, analysis.time_offset, find_offset_rerun(analysis)
     )
-    return " ".join(
-        advice_by_label[label] for label in ("Result", "Offset") if label in advice_by_label
-    )
+    return f"{advice_by_label.get('Result', '')} {advice_by_label['Offset']}".lstrip()
 
 
 def has_time_offset_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
@@ -91,6 +89,8 @@ def make_time_offset_advice(
             "Offset": estimate_sentence,
             "Action": "Check the timestamps of the ground truth, not of the positions.",
         }
+    # "Result" and "Offset" are always present, "Re-run" only for a significant offset. The other
+    # labels are independent of the result
     advice_by_label = {
         "Result": "The position source has no significant time offset.",
         "Offset": estimate_sentence,

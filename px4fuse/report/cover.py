@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -189,13 +189,15 @@ def write_panels(page: Page, analysis: Analysis, card: DiagnosisCard) -> None:
 def _draw_error_plots(page: Page, analysis: Analysis, card: DiagnosisCard, height: float) -> None:
     """Draw the position errors of KF and EKF2, or their difference."""
     result, effect = analysis.main.with_whole_flight_tracks(), card.effect
-    plots: list[tuple[str, float | None, pd.Series[float], SigmaByFilter]] = []
+    plots: list[_ErrorPlot] = []
     for filter_name, label in FILTER_NAMES.items():
         errors = compute_position_errors(result, filter_name)
         if isinstance(errors, pd.DataFrame) and errors["error_m"].notna().any():
             rmse_m = effect.position_rmse_m.get(filter_name) if effect else None
             sigmas_m = {label: errors["sigma_m"]}
-            plots.append((f"{label} error (m): RMSE", rmse_m, errors["error_m"], sigmas_m))
+            title = f"{label} error (m): RMSE"
+            plots.append(_ErrorPlot(title, rmse_m, errors["error_m"], sigmas_m))
+    # Without ground truth, the only plot is the difference of both filters
     if not plots and isinstance(result.ekf2_tracks.state, pd.DataFrame):
         time_s = result.ekf2_tracks.state.index.to_numpy()
         kf_track = predict_track(result.kf_run, time_s)
@@ -206,33 +208,34 @@ def _draw_error_plots(page: Page, analysis: Analysis, card: DiagnosisCard, heigh
         }
         difference_rms_m = effect.difference_rms_m if effect else None
         if difference_m.notna().any():
-            plots.append(("KF − EKF2 (m): RMS", difference_rms_m, difference_m, sigmas_m))
-    half_range_m = 1.1 * max(
-        (_compute_error_axis_limit_m(error_m, sigmas_m) for _, _, error_m, sigmas_m in plots),
-        default=0.0,
-    )
+            title = "KF − EKF2 (m): RMS"
+            plots.append(_ErrorPlot(title, difference_rms_m, difference_m, sigmas_m))
+    half_range_m = 1.1 * max(map(_compute_error_axis_limit_m, plots), default=0.0)
     for plot in plots:
-        _draw_error_plot(page, analysis, height, *plot, half_range_m)
+        _draw_error_plot(page, analysis, height, plot, half_range_m)
 
 
-def _compute_error_axis_limit_m(error_m: pd.Series[float], sigmas_m: SigmaByFilter) -> float:
-    largest_error_m = max(float(error_m.abs().max()), 1e-3)
-    sigma_limits_m = [2.2 * sigma.median() for sigma in sigmas_m.values()]
+class _ErrorPlot(NamedTuple):
+    """Error of a filter, or difference of both filters, with reported σ."""
+
+    title: str
+    rms_m: float | None
+    error_m: pd.Series[float]
+    sigmas_m: SigmaByFilter
+
+
+def _compute_error_axis_limit_m(plot: _ErrorPlot) -> float:
+    largest_error_m = max(float(plot.error_m.abs().max()), 1e-3)
+    sigma_limits_m = [2.2 * sigma.median() for sigma in plot.sigmas_m.values()]
     # The error axis ends at 3 times the largest error: if the reported σ is much too large, its
     # band is cut off, so that the errors remain visible
     return float(np.nanmax([largest_error_m, *np.minimum(sigma_limits_m, 3.0 * largest_error_m)]))
 
 
 def _draw_error_plot(
-    page: Page,
-    analysis: Analysis,
-    height: float,
-    title: str,
-    rms_m: float | None,
-    error_m: pd.Series[float],
-    sigmas_m: SigmaByFilter,
-    half_range_m: float,
+    page: Page, analysis: Analysis, height: float, plot: _ErrorPlot, half_range_m: float
 ) -> None:
+    title, rms_m, error_m, sigmas_m = plot
     known_sigmas_m = {
         name: sigma.dropna() for name, sigma in sigmas_m.items() if sigma.notna().any()
     }
@@ -320,6 +323,7 @@ def _draw_map(
 ) -> None:
     axes_width = page.width - AXES_LEFT_MARGIN - AXES_RIGHT_MARGIN
     limits = _compute_map_limits(tracks, axes_width / height)
+    # Largest distance of a track beyond the limits: |position - position clipped to the limits|
     distance_m, name = max(
         (np.nanmax(np.abs(track.T - np.clip(track.T, *limits))), name)
         for name, track in tracks.items()

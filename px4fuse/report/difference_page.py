@@ -112,12 +112,13 @@ def _draw_contributions(
         / total_mean_square
         * np.array([*reduction_by_setting.values(), unexplained_mean_square])
     )
+    max_percent = percents.max()
     axes = column.add_panel(title, BAR_ROW_HEIGHT * len(names), left_margin=LABEL_WIDTH)
     rows = range(len(names))
     axes.barh(rows, percents, height=0.7, color=KF_BAND_COLOUR, edgecolor=KF_COLOUR, lw=0.6)
     axes.set_yticks(rows, names)
     for row, percent in enumerate(percents):
-        axes.text(1.05 * percents.max(), row, f"{percent:z.1f} %", va="center", size=8.0)
+        axes.text(1.05 * max_percent, row, f"{percent:z.1f} %", va="center", size=8.0)
     axes.set_ylim(len(names) - 0.4, -0.6)
-    axes.set_xlim(min(0.0, 1.1 * percents.min()), 1.5 * percents.max())
+    axes.set_xlim(min(0.0, 1.1 * percents.min()), 1.5 * max_percent)
     axes.set_xlabel("% of the mean square difference")

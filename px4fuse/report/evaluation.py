@@ -10,6 +10,7 @@ from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
+from px4fuse.trajectory.alignment import compute_rms_length_m
 from px4fuse.trajectory.evaluation import AbsoluteTrajectoryError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME
 from px4fuse.trajectory.scores import RelativePoseError, RmseInterval, Statistics
@@ -27,7 +28,6 @@ ERROR_PLOT_HEIGHT = 110.0  # points
 MAP_HEIGHT = 150.0  # points
 COLOUR_BAR_MARGIN = 40.0  # points
 REFERENCE_LINE_STYLE = style.line_style(TRUTH_COLOUR, 0.8, (0, (4, 2)))
-NEGLIGIBLE_ERROR_M = 1e-6  # smaller errors can be rounding errors
 
 
 def draw_pages(evaluation: Evaluation, _: object) -> Iterator[Page]:
@@ -177,21 +177,16 @@ def _write_warnings(page: Page, evaluation: Evaluation) -> None:
 
 
 def _make_error_rows(evaluation: Evaluation) -> list[list[str]]:
-    error_by_name: dict[str, AbsoluteTrajectoryError | RelativePoseError] = {"ATE": evaluation.ate}
-    error_by_name |= {f"RPE over {error.delta_text}": error for error in evaluation.rpe}
     rows = []
-    for name, error in error_by_name.items():
-        translation_errors_m, cells = error.translation_m, ["–", *[""] * 5]
-        if isinstance(translation_errors_m, Statistics):
-            numbers = (
-                translation_errors_m.mean,
-                translation_errors_m.median,
-                translation_errors_m.std,
-                translation_errors_m.max,
-            )
+    errors: list[AbsoluteTrajectoryError | RelativePoseError] = [evaluation.ate, *evaluation.rpe]
+    for error in errors:
+        name = f"RPE over {error.delta_text}" if isinstance(error, RelativePoseError) else "ATE"
+        statistics, cells = error.translation_m, ["–", *[""] * 5]
+        if isinstance(statistics, Statistics):
+            numbers = (statistics.mean, statistics.median, statistics.std, statistics.max)
             number_texts = (f"{number:.3f}" for number in numbers)
-            cells = [format_error(error), *number_texts, f"{translation_errors_m.count}"]
-        rows.append([name, *cells, format_rmse(error.rotation_deg, 2)])
+            cells = [format_error(error), *number_texts, f"{statistics.count}"]
+        rows.append([name, *cells, format_rmse(error.rotation_deg)])
     return rows
 
 
@@ -208,7 +203,7 @@ def format_error(error: AbsoluteTrajectoryError | RelativePoseError) -> str:
 
 def describe_unaligned_rmse(evaluation: Evaluation) -> str:
     estimate_m, reference_m = evaluation.unaligned_position_m, evaluation.reference_position_m
-    rmse_m = float(np.sqrt(((estimate_m - reference_m) ** 2).sum(axis=1).mean()))
+    rmse_m = compute_rms_length_m(estimate_m - reference_m)
     alignment = evaluation.transform
     scale_text = f", scale {alignment.scale:.3g}" if alignment.degrees_of_freedom == 7 else ""
     centre_m = estimate_m.mean(axis=0)
@@ -220,8 +215,8 @@ def describe_unaligned_rmse(evaluation: Evaluation) -> str:
     )
 
 
-def format_rmse(statistics: Statistics | Unavailable, digits: int) -> str:
-    return f"{statistics.rmse:.{digits}f}" if isinstance(statistics, Statistics) else "–"
+def format_rmse(statistics: Statistics | Unavailable) -> str:
+    return f"{statistics.rmse:.2f}" if isinstance(statistics, Statistics) else "–"
 
 
 def describe_method(evaluation: Evaluation) -> str:

@@ -5,7 +5,7 @@ from functools import cache
 from pathlib import Path
 
 from matplotlib import font_manager
-from matplotlib.font_manager import FontEntry, FontPath
+from matplotlib.font_manager import FontPath
 
 from px4fuse.core.text import shorten_to_line
 
@@ -22,14 +22,10 @@ def find_font(character: str) -> str | None:
     """Return the name of an installed font with a character, or None."""
     if ord(character) in _read_font_characters(font_manager.findfont(FONT)):
         return FONT
-    return next(
-        (
-            name
-            for name, path in _list_fonts_except_dejavu()
-            if ord(character) in _read_font_characters(path)
-        ),
-        None,
-    )
+    for name, path in _list_fonts_except_dejavu():
+        if ord(character) in _read_font_characters(path):
+            return name
+    return None
 
 
 def find_font_names(text: str) -> list[str]:
@@ -83,22 +79,18 @@ def _list_fonts_except_dejavu() -> tuple[tuple[str, FontPath], ...]:
     ]
     return tuple(
         (entry.name, FontPath(entry.fname, entry.index))
-        for entry in sorted(entries, key=_font_sort_key)
-    )
-
-
-def _font_sort_key(entry: FontEntry) -> tuple[object, ...]:
-    """Return a sort key for fonts, by preference.
-
-    PostScript fonts are last, because some PDF viewers do not display them.
-    """
-    return (
-        entry.fname.lower().endswith(".otf"),
-        not entry.name.startswith("Noto Sans"),
-        "Sans" not in entry.name,
-        entry.name,
-        entry.fname,
-        entry.index,
+        for entry in sorted(
+            entries,
+            # PostScript fonts are last, because some PDF viewers do not display them
+            key=lambda entry: (
+                entry.fname.lower().endswith(".otf"),
+                not entry.name.startswith("Noto Sans"),
+                "Sans" not in entry.name,
+                entry.name,
+                entry.fname,
+                entry.index,
+            ),
+        )
     )
 
 

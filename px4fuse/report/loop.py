@@ -77,6 +77,7 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
 def _write_page(page: Page, loop: Loop) -> None:
     page.write(_describe_closure_error(loop))
     _write_segment(page, loop)
+    # The first line of the page already states the reason for an unknown true end
     missing_reasons = (
         f"No {correction.what}: {correction.reason}"
         for correction in loop.corrections.values()
@@ -199,13 +200,15 @@ def _write_rpe(page: Page, loop: Loop) -> None:
 
 
 def _make_rpe_row(path: PathResult, evaluation: Evaluation) -> list[str]:
+    # "RMSE m (95 % low to high)" becomes "RMSE m" with "low–high" on a second line, so that the
+    # columns are narrow
     error_texts = [
         "–"
         if isinstance(error.translation_m, Unavailable)
         else format_error(error).replace(" (95 % ", "\n").replace(" to ", "–").rstrip(")")
         for error in evaluation.rpe
     ]
-    rotation_text = format_rmse(evaluation.ate.rotation_deg, 2)
+    rotation_text = format_rmse(evaluation.ate.rotation_deg)
     return [path.name, f"{path.correction_rms_m:.2f}", *error_texts, rotation_text]
 
 

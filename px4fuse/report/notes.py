@@ -47,10 +47,12 @@ def write_markdown(page: Page, notes: str) -> None:
     from markdown_it import MarkdownIt  # noqa: PLC0415
 
     parser = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
+    # State between the tokens, which open and close nested elements:
     next_item_numbers = list[int]()  # number of the next item in each open list, unused for bullets
-    # level: number of open list items and quotations; marker: bullet or number of a list item that
-    # has no text yet
-    level, marker, previous_type, table_rows = 0, "", "", list[list[str]]()
+    level = 0  # number of open list items and quotes
+    marker = ""  # bullet or number of a list item, until it is written beside the first text
+    table_rows = list[list[str]]()  # cells of the open table
+    previous_type = ""  # type of the token before, which opens the element of an inline text
     for token in parser.parse(notes):
         # compute the indent before this token changes the level: an item without text ends here,
         # and its marker needs the indent of the item
@@ -58,6 +60,7 @@ def write_markdown(page: Page, notes: str) -> None:
         if marker and token.type not in ("paragraph_open", "inline"):
             page.write("", indent=indent, marker=marker)  # the item does not begin with a paragraph
             marker = ""
+        # nesting: 1 for an opening, -1 for a closing token
         level += token.nesting if token.type.startswith(("list_item", "blockquote")) else 0
         match token.type:
             case "bullet_list_open" | "ordered_list_open":

@@ -8,7 +8,6 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 from msgspec import Struct, structs
 
 from px4fuse.core.text import with_log_name
@@ -191,8 +190,7 @@ def _render_figure(block: Mapping[str, Any]) -> PageBlock:
     if "axes" in block:
         fields["frame"], axes = _place_axes(block), block["axes"]
         axes.apply_aspect()  # sets the final limits of maps
-        fields["x_axis"] = _find_ticks(axes, axes.xaxis)
-        fields["y_axis"] = _find_ticks(axes, axes.yaxis)
+        fields["x_axis"], fields["y_axis"] = _find_ticks(axes.xaxis), _find_ticks(axes.yaxis)
         axes.set_axis_off()  # the ticks of matplotlib are slow: each consists of five artists
     buffer = io.StringIO()
     block["figure"].savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
@@ -219,15 +217,17 @@ def _place_axes(block: Mapping[str, Any]) -> tuple[float, float, float, float]:
     return left_margin, top_margin, axes_width, height
 
 
-def _find_ticks(axes: Axes, axis: Any) -> tuple[list[tuple[float, str]], str]:
+def _find_ticks(axis: Any) -> tuple[list[tuple[float, str]], str]:
     """Return the ticks of an axis (fraction of its length, label), and the axis label."""
-    formatter, locations = axis.get_major_formatter(), np.asarray(axis.get_majorticklocs())
+    formatter, locations = axis.get_major_formatter(), axis.get_majorticklocs()
     labels = formatter.format_ticks(locations)
-    points = axes.transLimits.transform(axes.transScale.transform(np.stack([locations] * 2, 1)))
-    fractions = points[:, 0 if axis is axes.xaxis else 1].tolist()
+    # Scale (linear or logarithmic) of the axis
+    to_scale = axis.get_transform().transform
+    start, end = to_scale(axis.get_view_interval())
+    fractions = (to_scale(locations) - start) / (end - start)
     ticks = [
         (fraction, label)
-        for fraction, label in zip(fractions, labels, strict=True)
-        if -1e-9 <= fraction <= 1.0 + 1e-9
+        for fraction, label in zip(fractions.tolist(), labels, strict=True)
+        if -1e-9 <= fraction <= 1.0 + 1e-9  # ticks outside the axis are not drawn
     ]
     return ticks, f"{axis.get_label_text()} {formatter.get_offset()}".strip()

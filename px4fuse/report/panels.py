@@ -99,10 +99,9 @@ def add_time_panel(
         axes.set_xlabel(style.TIME_LABEL)
     axis_name = axis or analysis.main.axis.name
     rejection_times_s = analysis.events.rejection_times_s.get(axis_name, ())
-    for order, (_, times_or_spans_s, event_style, marker_height) in enumerate(
-        _make_event_markers(analysis, rejection_times_s), start=1
-    ):
-        if marker_height is None:
+    event_markers = _make_event_markers(analysis, rejection_times_s)
+    for order, (_, times_or_spans_s, event_style, marker_height) in enumerate(event_markers, 1):
+        if marker_height is None:  # bands over the whole height; later bands are on top
             starts_and_durations_s = [
                 (start_s, end_s - start_s) for start_s, end_s in times_or_spans_s
             ]
@@ -110,6 +109,7 @@ def add_time_panel(
             axes.broken_barh(starts_and_durations_s, (0.0, 1.0), **band_style)
         else:
             heights = pd.Series(marker_height, np.asarray(times_or_spans_s, np.float64))
+            # Markers at the lower edge (height 0) are drawn completely
             marker_style = event_style | {"zorder": 2.6, "clip_on": marker_height > 0.0}
             draw_curve(axes, heights, transform=x_transform, **marker_style)
     return axes

@@ -67,10 +67,13 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
         Results that are attached to the PDF as ``results.json``.
     """
     title = results.provenance.command
-    # Analysed file: the log, the odometry of px4fuse loop ("track"), or the trajectory of px4fuse
-    # evaluate ("estimate")
-    fields = (field for field in ("log", "track", "estimate") if hasattr(results, field))
-    source = getattr(results, next(fields))
+    match results:
+        case contract.LoopResults():
+            source = results.track
+        case contract.EvaluationResults():
+            source = results.estimate
+        case _:
+            source = results.log
     blocks = list[Any]()
     with apply_report_style():
         # Converting each page immediately saves memory

@@ -32,8 +32,6 @@ VERDICT_LEGEND = (
     "band."
 )
 SIGMA_ERROR_TEXTS = {"underconfident": "too large", "overconfident": "too small"}
-DIFFERENCE_FIELDS = ("position_rms_m", "velocity_rms_m_s")
-RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
 
 
 def format_settings(settings: Settings) -> str:
@@ -89,8 +87,10 @@ def write_error_table(page: Page, analysis: Analysis) -> None:
         for name, consistency in get_statistics_by_filter(result).items():
             difference = result.difference if name == "KF" else None
             cells = [
-                *(_format_rms(difference, field) for field in DIFFERENCE_FIELDS),
-                *(_format_rms(consistency.truth, field) for field in RMSE_FIELDS),
+                _format_rms(difference, "position_rms_m"),
+                _format_rms(difference, "velocity_rms_m_s"),
+                _format_rms(consistency.truth, "position_rmse_m"),
+                _format_rms(consistency.truth, "velocity_rmse_m_s"),
             ]
             rows.append([*make_verdict_row(result, name), *cells])
     head = [*VERDICT_TABLE_HEAD, "KF-EKF2 (m)", "(m/s)", "RMSE (m)", "(m/s)"]
@@ -130,10 +130,9 @@ def list_verdict_warnings(comparison: Comparison) -> list[str]:
 
 
 def format_clock_map(clock: ClockConversion) -> str:
-    is_described_by_note = (
-        clock.method in ("boot clock", "arrival time") or "own speed" in clock.note
-    )
-    if is_described_by_note or clock.distinct_stamps is not None:
+    # These timestamps are boot times, or unusable (arrival times, few distinct values): the note
+    # describes them, and they have no offset and no drift
+    if clock.method in ("boot clock", "arrival time") or clock.distinct_stamps is not None:
         return f"{clock.clock}: {clock.note}"
     return (
         f"{clock.clock}, mapped by {clock.method}: offset {clock.offset_s:+.4f} s, drift "
@@ -181,10 +180,14 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
 
 def format_noise_estimate(noise: NoiseEstimate, unit: str) -> str:
     """Format a maximum-likelihood noise with its 95 % interval."""
-    if noise.value is None:
-        if noise.high is not None:
-            return f"at most {noise.high:.2g} {unit}"
-        return "not identifiable" if noise.low is None else f"at least {noise.low:.2g} {unit}"
-    low_text = f"{noise.low or 0:.2g}"
-    interval_text = f"above {low_text}" if noise.high is None else f"{low_text} to {noise.high:.2g}"
-    return f"{noise.value:.3g} {unit} (95 % {interval_text})"
+    if noise.value is not None:
+        low_text = f"{noise.low or 0:.2g}"  # without a lower bound, the interval begins at 0
+        interval_text = (
+            f"above {low_text}" if noise.high is None else f"{low_text} to {noise.high:.2g}"
+        )
+        return f"{noise.value:.3g} {unit} (95 % {interval_text})"
+    if noise.high is not None:
+        return f"at most {noise.high:.2g} {unit}"
+    if noise.low is not None:
+        return f"at least {noise.low:.2g} {unit}"
+    return "not identifiable"

@@ -21,7 +21,8 @@ def draw_pages(analysis: Analysis | AidingSourceAnalysis, results: FlightResults
     """Draw the pages on detected faults and on provenance."""
     page = Page(ALL_FINDINGS_TITLE)
     write_findings(page, results.findings)
-    page.write("" if results.findings else "None.")
+    if not results.findings:
+        page.write("None.")
     yield page
     flight = analysis.flight
     if isinstance(analysis, Analysis):

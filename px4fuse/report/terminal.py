@@ -55,7 +55,8 @@ def make_comparison_page(
         page.write_muted_text(VERDICT_LEGEND)
         page.write_heading("Findings")
         write_findings(page, results.findings)
-        page.write("" if results.findings else "None.")
+        if not results.findings:
+            page.write("None.")
     else:
         _write_details(page, analysis, results)
     return page

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from px4fuse.comparison.estimates import find_first_available_tuning
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.remedy import format_changes, make_height_noise_advice, make_noise_change
 from px4fuse.filter.signals import AISLE_AXIS
@@ -41,13 +42,10 @@ def list_tuning_advice(
     comparison: PreparedComparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
 ) -> Iterator[tuple[str, str]]:
     """Yield advice from the noise estimates as pairs (label, text)."""
-    names = (HORIZONTAL, AISLE_AXIS, *tuning_by_axis)
-    tunings = [
-        tuning for name in names if isinstance(tuning := tuning_by_axis.get(name), AxisTuning)
-    ]
-    if not tunings:
+    tuning = find_first_available_tuning(tuning_by_axis, HORIZONTAL, AISLE_AXIS, *tuning_by_axis)
+    if tuning is None:
         return
-    tuning, origin, settings = tunings[0], comparison.source.origin, comparison.settings
+    origin, settings = comparison.source.origin, comparison.settings
     axis_name = tuning.name.replace(AISLE_AXIS, "axis of largest motion")
     sigma_a, sigma_z = tuning.sigma_a_two_state, tuning.sigma_z
     noises = (
@@ -125,9 +123,11 @@ def _make_vision_noise_advice(comparison: PreparedComparison, estimate: NoiseEst
     low_m, high_m = estimate.low or 0.0, estimate.high or np.inf
     variance_m2 = comparison.source.samples[Columns.POSITION_VARIANCE[:2]].median().mean()
     reported_sigma_m = 0.0 if np.isnan(variance_m2) else float(np.sqrt(variance_m2))
+    # The noise parameter, and the mode parameter if EKF2 uses a σ from the messages that is larger
+    # than the estimate
     changes = make_noise_change(EV_POS, parameters, reported_sigma_m, estimate.value)
     noise_parameter_m = parameters.get(name, np.nan)
-    # EKF2 used a too large σ of the messages: it must use its noise parameter instead
+    # The σ from the messages is significantly too large: EKF2 must use its noise parameter instead
     if EV_POS.noise_mode_parameter in changes and reported_sigma_m > high_m:
         return (
             f"Set {format_changes(changes)}. The source reported a σ of {reported_sigma_m:.2g} m."

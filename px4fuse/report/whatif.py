@@ -37,24 +37,25 @@ def describe_changes(analysis: WhatIfAnalysis) -> str:
 
 def list_statistics(analysis: WhatIfAnalysis) -> Iterator[str]:
     """Yield lines with the statistics of EKF2 as replayed, and with changed parameters."""
-    result, changes_text, changed_columns = analysis.statistics, describe_changes(analysis), []
-    for summary in result.whatif[: analysis.sweep_start_index]:
-        if summary.is_predictable:
-            changed_columns.append(_format_statistics(summary))
+    result, changes_text = analysis.statistics, describe_changes(analysis)
+    changed_texts, change_text = dict[str, str](), ""
+    if analysis.sweep_start_index:  # the first replay is not part of the sweep
+        if result.whatif[0].is_predictable:
+            changed_texts, change_text = _format_statistics(result.whatif[0]), f" → {changes_text}"
         else:
             yield f"EKF2 (replay), {changes_text}: {NOT_PREDICTABLE_TEXT}"
     spans_text = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in result.evaluated_s)
-    change_text = f" → {changes_text}" * len(changed_columns)
     yield f"{analysis.flight.log.name}, {spans_text}, EKF2 (replay) as flown{change_text}:"
     for label, replayed_text in _format_statistics(result.replayed).items():
+        if replayed_text == "n/a":
+            continue
         text = replayed_text
-        for column in changed_columns:
-            changed_text = column.get(label, "n/a")
-            # remove a unit or an expected NIS that the next text repeats, so that it is printed
-            # once. The expected NIS differs if the number of samples differs
-            text = text.removesuffix(f" {changed_text.partition(' ')[2]}") + f" → {changed_text}"
-        if replayed_text != "n/a":
-            yield f"EKF2 (replay), {label} {text}"
+        if changed_texts:
+            changed_text = changed_texts.get(label, "n/a")
+            # Unit or expected NIS after the number. If both texts have the same, it is printed once
+            unit = changed_text.partition(" ")[2]
+            text = f"{text.removesuffix(f' {unit}')} → {changed_text}"
+        yield f"EKF2 (replay), {label} {text}"
 
 
 def _format_statistics(summary: Ekf2Statistics) -> dict[str, str]:

@@ -79,6 +79,7 @@ def associate(
         Fewer than three poses match.
     """
     estimate_interval_s = compute_median_interval_s(estimate.time_s)
+    # Default of the maximum gap, which can also change the method
     if max_gap_s is None:
         max_interpolated_interval_s = max(MIN_SPARSE_POSE_INTERVAL_S, 2.0 * estimate_interval_s)
         if method == "nearest":
@@ -88,6 +89,7 @@ def associate(
             method, max_gap_s = "nearest", estimate_interval_s
         else:
             max_gap_s = choose_gap_limit_s(reference.time_s)
+    # Match the poses
     time_s = estimate.time_s + time_offset_s
     reference_start_s, reference_end_s = reference.time_s[[0, -1]]
     margin_s = 0.0
@@ -110,18 +112,21 @@ def associate(
             "Check that both trajectories are of the same flight. If the clocks differ, "
             "set `time_offset_s` to auto.",
         )
+    # Count the unused poses, and the fractions of both trajectories that are evaluated. In pairs of
+    # nearest poses, an estimated pose can occur several times
     is_outside = (time_s < reference_start_s - margin_s) | (time_s > reference_end_s + margin_s)
-    pose_count_outside_reference = int(is_outside.sum())
-    # A longer interval between two used poses is a gap, which does not count as covered
-    intervals_s = np.diff(time_s[pose_indices])
-    covered_duration_s = intervals_s[intervals_s <= max(5.0 * estimate_interval_s, 0.5)].sum()
+    outside_count = int(is_outside.sum())
     used_pose_count, pose_count = len(np.unique(pose_indices)), len(estimate)
+    # A longer interval (s) between two used poses is a gap, which does not count as covered
+    max_covered_interval_s = max(5.0 * estimate_interval_s, 0.5)
+    intervals_s = np.diff(time_s[pose_indices])
+    covered_duration_s = intervals_s[intervals_s <= max_covered_interval_s].sum()
     association = Association(
         method=method,
         poses=len(pose_indices),
         max_gap_s=max_gap_s,
-        outside=pose_count_outside_reference,
-        in_gaps=pose_count - pose_count_outside_reference - used_pose_count,
+        outside=outside_count,
+        in_gaps=pose_count - outside_count - used_pose_count,
         coverage_estimate=used_pose_count / pose_count,
         coverage_reference=min(
             float(covered_duration_s / (reference_end_s - reference_start_s)), 1.0
@@ -137,16 +142,15 @@ def choose_gap_limit_s(time_s: Array, min_gap_limit_s: float = MIN_GAP_LIMIT_S) 
 
 def is_bracketed(time_s: Array, reference_time_s: Array, gap_limit_s: float) -> BoolArray:
     """Return a mask of times whose neighbouring reference times differ by at most a limit."""
-    next_indices = np.searchsorted(reference_time_s[1:-1], time_s) + 1
-    previous_time_s, next_time_s = (
-        reference_time_s[next_indices - 1],
-        reference_time_s[next_indices],
-    )
+    # Neighbours of each time. The limits also give two neighbours to times outside the reference
+    next_indices = np.searchsorted(reference_time_s, time_s).clip(1, len(reference_time_s) - 1)
+    previous_time_s = reference_time_s[next_indices - 1]
+    next_time_s = reference_time_s[next_indices]
     is_between = (previous_time_s <= time_s) & (time_s <= next_time_s)
     is_near = next_time_s - previous_time_s <= gap_limit_s
-    return np.asarray(
-        (is_between & is_near) | (previous_time_s == time_s) | (next_time_s == time_s)
-    )
+    # A time at a reference pose needs no interpolation, so the gap beside it does not matter
+    is_at_reference_pose = (previous_time_s == time_s) | (next_time_s == time_s)
+    return np.asarray((is_between & is_near) | is_at_reference_pose)
 
 
 def _interpolate_poses(trajectory: Trajectory, time_s: Array) -> Trajectory:
@@ -167,8 +171,10 @@ def _pair_nearest(
     is_estimate_denser = len(estimate_time_s) > len(reference_time_s)
     sparse_time_s = reference_time_s if is_estimate_denser else estimate_time_s
     dense_time_s = estimate_time_s + offset_s if is_estimate_denser else reference_time_s - offset_s
-    # Each pose of the sparse trajectory is paired with the previous or the next dense pose
-    next_indices = np.searchsorted(dense_time_s[1:-1], sparse_time_s, side="right") + 1
+    # Each pose of the sparse trajectory is paired with the previous or the next dense pose. The
+    # limits also give two neighbours to times outside the dense trajectory
+    next_indices = np.searchsorted(dense_time_s, sparse_time_s, side="right")
+    next_indices = next_indices.clip(1, len(dense_time_s) - 1)
     time_to_previous_s = np.abs(sparse_time_s - dense_time_s[next_indices - 1])
     is_next_nearer = np.abs(dense_time_s[next_indices] - sparse_time_s) < time_to_previous_s
     nearest_indices = np.where(is_next_nearer, next_indices, next_indices - 1)

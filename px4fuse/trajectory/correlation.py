@@ -50,11 +50,15 @@ def compute_moments(
         np.where(is_known, values - np.mean(values[is_known]), 0.0)
         for values, is_known in ((a, is_known_a), (b, is_known_b))
     )
+    # At each lag, sums over the common samples are correlations with the mask of the other series.
+    # _correlate conjugates its second argument: the first is b or its mask, the second a or its
+    # mask. Unknown samples are 0
     mask_a = is_known_a.astype(float)
     mask_b = is_known_b.astype(float)
     common_sample_count = np.rint(_correlate(mask_b, mask_a).real)
     reciprocal_count = 1.0 / np.maximum(common_sample_count, 1.0)
     conjugate_sum_a, sum_b = _correlate(mask_b, a), _correlate(b, mask_a)
+    # Moments about the means: Σ conj(a - ā)(b - b̄) = Σ conj(a) b - (Σ conj(a)) (Σ b) / count
     covariance = _correlate(b, a) - conjugate_sum_a * sum_b * reciprocal_count
     sum_of_squares_a = (
         _correlate(mask_b, np.abs(a) ** 2).real - np.abs(conjugate_sum_a) ** 2 * reciprocal_count
@@ -71,7 +75,11 @@ def autocovariance(values: Array | ComplexArray) -> Array:
 
 
 def _correlate(a: Array | ComplexArray, b: Array | ComplexArray) -> ComplexArray:
-    """Compute the cross-correlation of two series, like ``scipy.signal.correlate``."""
+    """Compute the cross-correlation of two series, like ``scipy.signal.correlate``.
+
+    The import of ``scipy.signal`` is slow. The value at index n - 1 + l is Σ a_(k+l) conj(b_k), for
+    n values of b.
+    """
     lag_count = len(a) + len(b) - 1
     is_complex = np.iscomplexobj(a) or np.iscomplexobj(b)
     transform: Any = fft.fft if is_complex else fft.rfft

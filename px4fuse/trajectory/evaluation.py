@@ -266,7 +266,8 @@ def evaluate(
         max_gap_s=max_gap_s,
         time_offset_s=added_offset_s,
     )
-    # 2. Align. If the user did not choose the alignment, insufficient motion is only a warning
+    # 2. Choose and fit the alignment. If the user did not choose it, insufficient motion is only a
+    # warning
     alignment_reason, is_alignment_given = "The user chose the alignment.", alignment is not None
     if alignment is None:
         alignment, alignment_reason = choose_alignment(matched_estimate, matched_reference)
@@ -312,8 +313,8 @@ def evaluate(
     )
     position_statistics = compute_statistics(position_error_m)
     if better_offset_s is not None:
-        # With better_offset_s, too few poses may match in time, or the matched poses may not move:
-        # then no warning
+        # Evaluate again, to state in a warning how much the better time offset reduces the ATE.
+        # With this offset, too few poses may match, or they do not move: then no warning
         with suppress(TrajectoryError):
             better_evaluation = evaluate(
                 estimate,
@@ -356,6 +357,7 @@ def evaluate(
         reference_position_m=matched_reference.position_m,
         position_error_m=position_error_m,
         notes=(*estimate_notes, *reference_notes, *notes),
+        # ``warnings``: frozen poses, jumps, uncertain alignment, and ground truth as estimate
         warnings=(
             *warnings,
             *_find_mirror_warnings(
@@ -395,7 +397,6 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
         return "yaw", (
             f"{yaw_text}z is vertical in both frames ({frames_text}), so a tilt counts as an error."
         )
-    scale = 1.0
     try:
         scale = fit_alignment(estimate.position_m, reference.position_m, "sim3").scale
     except TrajectoryError:
@@ -404,21 +405,26 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
                 f"{yaw_text}motion along a line does not determine the rotation, but z is vertical "
                 f"in both frames ({frames_text})."
             )
-    tracks_without_vertical = [
-        track for track in (estimate, reference) if track.kind in _KINDS_WITHOUT_KNOWN_VERTICAL
-    ]
+        scale = 1.0  # unknown
     se3_text = "Rotation and translation are aligned (6 degrees of freedom): "
-    if not tracks_without_vertical:
+    if estimate.kind in _KINDS_WITHOUT_KNOWN_VERTICAL:
+        track_without_vertical = estimate
+    elif reference.kind in _KINDS_WITHOUT_KNOWN_VERTICAL:
+        track_without_vertical = reference
+    else:
         return "se3", f"{se3_text}the frames {frames_text} have no common vertical direction."
     cause = "the source of this trajectory is unknown"
-    if tracks_without_vertical[0].kind == "slam":
+    if track_without_vertical.kind == "slam":
         cause = "SLAM uses the frame of the first key frame"
     frame_reason = (
-        f"the vertical direction of {tracks_without_vertical[0].name} is unknown, because {cause}"
+        f"the vertical direction of {track_without_vertical.name} is unknown, because {cause}"
     )
-    names = [*filter(_MONOCULAR_PATTERN.search, (estimate.name, reference.name))]
-    if names:
-        scale_reason = f"the file name {names[0]} indicates monocular SLAM"
+    # Monocular SLAM has no scale
+    monocular_names = [
+        name for name in (estimate.name, reference.name) if _MONOCULAR_PATTERN.search(name)
+    ]
+    if monocular_names:
+        scale_reason = f"the file name {monocular_names[0]} indicates monocular SLAM"
     elif abs(scale - 1.0) > MAX_SCALE_ERROR:
         scale_reason = (
             f"the scale factor {scale:.3g} differs from 1 by more than {MAX_SCALE_ERROR:.0%}"
@@ -436,12 +442,20 @@ def _choose_time_offset(
 ) -> tuple[TimeOffset, list[str], float | None]:
     """Choose the time offset to add to the timestamps of the estimate.
 
-    Return also warnings. If the timestamps are used as they are, but another time offset (s) fits
-    better, return also that offset, so that the caller can warn; else None.
+    Returns
+    -------
+    time_offset : TimeOffset
+        Offset given by the user, estimated offset, or offset between the clocks.
+    warnings : list of str
+        Reason why an offset cannot be estimated, if an estimate is needed.
+    better_offset_s : float or None
+        Estimated offset, if it differs significantly from the offset between the clocks and is not
+        used. The caller warns.
     """
     if isinstance(given_offset_s, float | int):
         reason = "The user chose the time offset."
         return TimeOffset(offset_s=given_offset_s, is_determinable=True, reason=reason), [], None
+    # Offset between the clocks; files without UNIX time count as recordings of the same clock
     clock_offset_s = compute_clock_offset_s(estimate, reference)
     added_offset_s = clock_offset_s or 0.0
     match_text = (
@@ -450,6 +464,7 @@ def _choose_time_offset(
     estimated_offset = estimate_time_offset(estimate, reference)
     start_s, end_s = estimate.time_s[[0, -1]] + added_offset_s
     is_disjoint = start_s > reference.time_s[-1] or end_s < reference.time_s[0]
+    # An estimate is needed if the user asks for it, or if the times do not overlap
     if given_offset_s == "auto" or is_disjoint:
         if estimated_offset.is_determinable:
             return estimated_offset, [], None
@@ -457,14 +472,14 @@ def _choose_time_offset(
         fallback = TimeOffset(offset_s=added_offset_s, is_determinable=False, reason=reason)
         return fallback, [f"{reason} {match_text}"], None
     time_offset = TimeOffset(offset_s=added_offset_s, is_determinable=True, reason=match_text)
-    # If no time offset can be estimated, the added offset counts as the best
-    low_s, high_s = estimated_offset.interval_s or (added_offset_s, added_offset_s)
-    best_offset_s = estimated_offset.offset_s or added_offset_s
-    has_better_offset = (
-        not low_s <= added_offset_s <= high_s
-        and abs(best_offset_s - added_offset_s) >= MIN_REPORTED_TIME_OFFSET_S
-    )
-    return time_offset, [], best_offset_s if has_better_offset else None
+    best_offset_s = estimated_offset.offset_s
+    if best_offset_s is None or estimated_offset.interval_s is None:
+        return time_offset, [], None
+    low_s, high_s = estimated_offset.interval_s
+    is_significant = not low_s <= added_offset_s <= high_s
+    if is_significant and abs(best_offset_s - added_offset_s) >= MIN_REPORTED_TIME_OFFSET_S:
+        return time_offset, [], best_offset_s
+    return time_offset, [], None
 
 
 def _find_better_offset_warnings(
@@ -541,10 +556,14 @@ def _move_to_reference_body(
     """Convert the poses of the estimate to the body axes and body origin of the reference."""
     assert estimate.rotation is not None
     assert reference.rotation is not None
+    # Model of the position error at each pose: R lever_arm + constant, with the rotation R of the
+    # reference. Subtracting the mean values removes the constant, and least squares give lever_arm
     reference_rotation_matrices = reference.rotation.as_matrix()
     centred_rotation_matrices = (
         reference_rotation_matrices - reference_rotation_matrices.mean(axis=0)
     ).reshape(-1, 3)
+    # The alignment depends on the lever arm, and the lever arm on the alignment: estimate both in
+    # turn. The corrected positions are only for the alignment
     corrected_estimate = estimate
     for _ in range(LEVER_ARM_ITERATIONS):
         transform = fit_alignment(corrected_estimate.position_m, reference.position_m, alignment)
@@ -572,14 +591,11 @@ def _rotate_to_reference_body(
     aligned_estimate: Trajectory, reference: Trajectory
 ) -> tuple[Trajectory, tuple[str, ...]]:
     """Remove the constant rotation between camera and vehicle axes, and return a note."""
-    # The body axes differ if only one trajectory is in a camera frame, or if one is from SLAM
-    # (camera axes) and the other one is in a frame of vehicles
-    vehicle_frames = (*_Z_DOWN_FRAMES, "ENU")
-    body_axes_differ = (aligned_estimate.frame == "camera") != (reference.frame == "camera") or any(
-        track.kind == "slam"
-        and other_track.frame in vehicle_frames
-        and track.frame not in vehicle_frames
-        for track, other_track in ((aligned_estimate, reference), (reference, aligned_estimate))
+    # Body axes are camera axes in a camera frame, and probably also for SLAM in an unknown frame.
+    # They differ between such a trajectory and a trajectory in another frame
+    body_axes_differ = aligned_estimate.frame != reference.frame and any(
+        track.frame == "camera" or (track.kind == "slam" and track.frame == "unknown")
+        for track in (aligned_estimate, reference)
     )
     rotation_of_estimate = aligned_estimate.rotation
     if rotation_of_estimate is None or reference.rotation is None or not body_axes_differ:

@@ -82,11 +82,13 @@ def cumulative_product(quaternions: Array) -> Array:
     """Compute the products q_0, q_0 ⊗ q_1, q_0 ⊗ q_1 ⊗ q_2, ... of quaternions, shape (n, 4)."""
     if len(quaternions) < 2:
         return quaternions
-    # Recursion: the cumulative products of pairs of quaternions are every second result. Each of
-    # the other results needs one more multiplication
+    # Recursion with half as many quaternions: the products of the pairs (q_0, q_1), (q_2, q_3), ...
+    # A last quaternion without a partner is in no pair
     product = np.empty_like(quaternions)
     product[0] = quaternions[0]
+    # Products up to q_1, q_3, ...: the cumulative products of the pairs
     product[1::2] = cumulative_product(multiply(quaternions[:-1:2], quaternions[1::2]))
+    # Products up to q_2, q_4, ...: the product before, multiplied by this quaternion
     product[2::2] = multiply(product[1:-1:2], quaternions[2::2])
     return np.asarray(product / np.linalg.norm(product, axis=1, keepdims=True))
 

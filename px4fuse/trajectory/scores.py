@@ -188,8 +188,9 @@ def find_pose_pairs(
     if not all_pairs:
         return _find_consecutive_pairs(np.diff(distance_or_time), delta.value)
     start_indices = np.arange(pose_count - 1)
-    # The nearest pose is the first at or above the distance, or the pose before it. Rounding errors
-    # may change the result, so their neighbours are tested too
+    # Candidates for the second pose, one row per pair: the first pose at or above the distance, the
+    # pose before it, and their neighbours, because rounding errors may change the result. They are
+    # limited to the poses after the start
     nearest_indices = np.searchsorted(distance_or_time, distance_or_time + delta.value)[:-1]
     candidate_indices = np.clip(
         nearest_indices[:, None] + np.arange(-2, 2), start_indices[:, None] + 1, pose_count - 1
@@ -197,11 +198,11 @@ def find_pose_pairs(
     candidates = distance_or_time[candidate_indices]
     pair_distance_error = np.abs(candidates - distance_or_time[start_indices, None] - delta.value)
     best_columns = np.argmin(pair_distance_error, axis=1)
-    # While the vehicle is at rest, several poses have the same path length from the start: use the
-    # first of them
+    # While the vehicle is at rest, several poses have the same distance. Use the first of them that
+    # is after the start
     end_indices = np.searchsorted(distance_or_time, candidates[start_indices, best_columns])
     end_indices = np.maximum(end_indices, start_indices + 1)
-    min_error = pair_distance_error[start_indices, best_columns]
+    min_error = pair_distance_error.min(axis=1)
     is_distance_near_delta = min_error <= MAX_RELATIVE_PAIR_DISTANCE_ERROR * delta.value
     return start_indices[is_distance_near_delta], end_indices[is_distance_near_delta]
 
@@ -241,6 +242,7 @@ def compute_relative_pose_error(
         reference.position_m, reference.time_s, delta, all_pairs=all_pairs
     )
     analysis_name = f"RPE over {delta}"
+    # Arguments of the result: translation_m, interval_m, rotation_deg
     make_result = partial(RelativePoseError, delta.value, delta.unit, all_pairs, "reference")
     if not len(start_indices):
         no_pairs_result = Unavailable(
@@ -249,27 +251,32 @@ def compute_relative_pose_error(
             "Use another distance of RPE pairs (delta).",
         )
         return make_result(no_pairs_result, no_pairs_result, no_pairs_result)
-    displacements_m = [
+    # Displacements in each pair, in the frame of the reference
+    estimate_m, reference_m = (
         track.position_m[end_indices] - track.position_m[start_indices]
         for track in (aligned_estimate, reference)
-    ]
+    )
     rotations = get_rotations(aligned_estimate, reference, analysis_name)
     rotation_deg: OrUnavailable[Statistics]
     if isinstance(rotations, Unavailable):
-        # without orientations, displacements are in the frame of the reference
         rotation_deg = rotations
     else:
-        # with orientations, each displacement is in the axes of its first pose
-        relative_rotations = []
-        for index, rotation in enumerate(rotations):
-            start_rotation_inverse = rotation[start_indices].inv()
-            displacements_m[index] = start_rotation_inverse.apply(displacements_m[index])
-            relative_rotations.append(start_rotation_inverse * rotation[end_indices])
-        estimated_rotation, reference_rotation = relative_rotations
-        rotation_deg = compute_rotation_statistics(reference_rotation, estimated_rotation)
+        # With orientations, convert each displacement to the axes of the first pose of its pair
+        estimate_start_inverse, reference_start_inverse = (
+            rotation[start_indices].inv() for rotation in rotations
+        )
+        estimate_m = estimate_start_inverse.apply(estimate_m)
+        reference_m = reference_start_inverse.apply(reference_m)
+        estimate_rotation, reference_rotation = rotations
+        rotation_deg = compute_rotation_statistics(
+            reference_start_inverse * reference_rotation[end_indices],
+            estimate_start_inverse * estimate_rotation[end_indices],
+        )
     # Error of the displacement between the two poses: estimate minus reference. It is as long as
     # the translation of the pose error E, because a rotation does not change the length
-    translation_m = np.linalg.norm(displacements_m[0] - displacements_m[1], axis=1)
+    translation_m = np.linalg.norm(estimate_m - reference_m, axis=1)
+    # Pairs that overlap have correlated errors: a pair overlaps with as many following pairs as it
+    # has steps. A bootstrap block contains all of them
     overlapping_pair_count = int(np.median(end_indices - start_indices)) if all_pairs else 1
     rmse_interval_m = estimate_rmse_interval(
         translation_m, analysis_name, min_block_length=overlapping_pair_count
@@ -317,7 +324,7 @@ def estimate_rmse_interval(
     # Mean squared error of each circular block
     block_means = (
         cumulative_squared_errors[block_length:] - cumulative_squared_errors[:-block_length]
-    ) / (block_length)
+    ) / block_length
     block_count = error_count / block_length
     block_starts = np.random.default_rng(BOOTSTRAP_SEED).integers(
         0, error_count, (BOOTSTRAP_RESAMPLES, round(block_count))

@@ -3,6 +3,7 @@
 Candidates are the peaks of the correlation of speeds. Least squares refines the best candidates.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -240,25 +241,28 @@ def _find_candidate_offsets_s(sparse_track: Trajectory, dense_track: Trajectory)
         return []
     sparse_track_speeds, is_sparse_speed_known = _compute_speeds(sparse_track, step_s)
     dense_track_speeds, is_dense_speed_known = _compute_speeds(dense_track, step_s)
+    # 1. Correlation at each lag: mean of the correlations of speed and angular speed. If a
+    # trajectory has no orientations, only the speeds are correlated
     correlations = []
-    # If a trajectory has no orientations, only the speeds are correlated, and no angular speeds
     for sparse_values, dense_values in zip(sparse_track_speeds, dense_track_speeds, strict=False):
         moments = compute_moments(
             sparse_values, dense_values, is_sparse_speed_known, is_dense_speed_known
         )
-        # At each lag, the overlap must be long, and both speeds must vary
         is_usable = moments.count >= MIN_OVERLAP_FRACTION * shorter_duration_s / step_s
-        # At rest, the variance of the speed is a rounding error
+        # Both speeds must vary in the overlap: their variance must be at least 0.1 % of that of the
+        # whole trajectory. At rest, it is a rounding error
         for values, is_known, square_sum in (
             (sparse_values, is_sparse_speed_known, moments.sum_of_squares_a),
             (dense_values, is_dense_speed_known, moments.sum_of_squares_b),
         ):
             mean_square = np.var(values[is_known]) * np.mean(is_known)
             is_usable &= square_sum > 1e-3 * mean_square * moments.count
+        # With an infinite scale, the correlation at unusable lags is 0
         product_of_square_sums = moments.sum_of_squares_a * moments.sum_of_squares_b
         scale = np.sqrt(np.where(is_usable, product_of_square_sums, np.inf))
         correlations.append(moments.covariance.real / scale)
     correlation = np.mean(correlations, axis=0)
+    # 2. Highest peaks of the correlation. A peak is the maximum of all lags around it
     sliding_maximum = maximum_filter1d(
         correlation, round(2 * MIN_CORRELATION_PEAK_DISTANCE_S / step_s) + 1
     )
@@ -266,7 +270,8 @@ def _find_candidate_offsets_s(sparse_track: Trajectory, dense_track: Trajectory)
         (correlation == sliding_maximum) & (correlation > MIN_SPEED_CORRELATION)
     )
     peak_indices = peak_indices[np.argsort(-correlation[peak_indices])][:MAX_CANDIDATE_OFFSETS]
-    # Correlation index k is a shift by k - (n - 1) samples, for n sparse samples
+    # 3. Time offsets of the peaks. Correlation index k is a shift by k - (n - 1) samples, for n
+    # sparse samples. The grids of both trajectories begin at their first poses
     sparse_start_indices = peak_indices - (len(is_sparse_speed_known) - 1)
     lags_s = sparse_start_indices * step_s + dense_track.time_s[0] - sparse_track.time_s[0]
     return list(lags_s.tolist())
@@ -309,13 +314,15 @@ def _compute_interval_half_width_s(
     It is infinite if a shift or rotation of the trajectory has the same effect as a time offset.
     """
     pose_count = len(fit.time_s)
-    centred_m = fit.aligned_position_m - fit.aligned_position_m.mean(axis=0)
+    # 1. A time offset dt changes the positions by velocity * dt. Velocities of both trajectories
     dense_track_velocity_m_s = _compute_velocity(dense_track, fit.time_s + fit.offset_s)
     sparse_track_velocity_m_s = fit.transform.to_rotation().apply(
         fit.transform.scale * _compute_velocity(sparse_track, fit.time_s)
     )
-    # The alignment (shift, rotation, scale) is fitted together with the time offset. Velocity that
-    # a change of the alignment explains is removed, because it does not determine the time offset
+    # 2. The alignment (shift, rotation, scale) is fitted together with the time offset. Velocity
+    # that a change of the alignment explains is removed, because it does not determine the time
+    # offset. Columns of the Jacobian: change of the positions by each of the 7 parameters
+    centred_m = fit.aligned_position_m - fit.aligned_position_m.mean(axis=0)
     columns = [np.tile(axis, (pose_count, 1)) for axis in np.eye(3)]
     columns += [np.cross(axis, centred_m) for axis in np.eye(3)]
     similarity_jacobian = np.stack([*columns, centred_m], axis=-1).reshape(3 * pose_count, 7)
@@ -329,6 +336,8 @@ def _compute_interval_half_width_s(
     dense_residuals, sparse_residuals = residual_velocities.T
     dense_track_square_sum = float(dense_residuals @ dense_residuals)
     sparse_track_square_sum = float(sparse_residuals @ sparse_residuals)
+    # 3. The remaining velocity must not be small, and must be the same motion in both trajectories,
+    # not noise
     if (
         dense_track_square_sum
         <= MIN_RESIDUAL_VELOCITY_FRACTION**2 * float((dense_track_velocity_m_s**2).sum())
@@ -337,8 +346,10 @@ def _compute_interval_half_width_s(
         * (dense_track_square_sum * sparse_track_square_sum) ** 0.5
     ):
         return float("inf")
-    # Derivative of the log-likelihood with respect to the time offset, for each pose. The poses are
-    # correlated, so the variance of the sum contains the products at other lags
+    # 4. Least squares: σ of the time offset is √(variance of the sum of v·r) ÷ Σ v², with remaining
+    # velocity v and position residual r. v·r is the derivative of the log-likelihood with respect
+    # to the time offset, for each pose. The poses are correlated, so the variance of the sum
+    # contains the products at other lags
     likelihood_score = (
         dense_residuals.reshape(pose_count, 3)
         * (fit.dense_track_position_m - fit.aligned_position_m)
@@ -355,6 +366,7 @@ def _compute_interval_half_width_s(
     score_variance = variance_if_uncorrelated + max(
         2.0 * (lag_weights @ lagged_autocovariances), 0.0
     )
+    # Each interval of lag_count poses counts as one independent value
     student_t_quantile = float(stdtrit(max(pose_count / lag_count - 1.0, 1.0), 0.975))
     return float(student_t_quantile * np.sqrt(score_variance) / dense_track_square_sum)
 
@@ -381,13 +393,15 @@ def _refine_offset(
         for shift in (-half_width_s, 0.0, half_width_s)
     ]
     pose_indices = np.flatnonzero(np.all(is_known, axis=0))
+    # A short dense trajectory can overlap with a part of the poses only
     duration_ratio = min(1.0, float(np.ptp(dense_track.time_s) / np.ptp(sparse_time_s)))
     min_pose_count = max(
         2 * MIN_POSES, MIN_USED_POSES_FRACTION * duration_ratio * len(sparse_time_s)
     )
     if len(pose_indices) < min_pose_count:
         return None
-    pose_indices = pose_indices[:: -(-len(pose_indices) // MAX_FITTED_POSES)]
+    stride = math.ceil(len(pose_indices) / MAX_FITTED_POSES)
+    pose_indices = pose_indices[::stride]
     sparse_time_s = sparse_time_s[pose_indices]
     sparse_position_m = sparse_track.position_m[pose_indices]
 
@@ -410,8 +424,10 @@ def _refine_offset(
         fit = make_fit(shift_s)
         return float(((fit.dense_track_position_m - fit.aligned_position_m) ** 2).sum())
 
-    # The optimiser has a relative tolerance, so the large offset (up to 1e9 s) is not optimised
+    # Best of 21 shifts, then refinement between its neighbours. The optimiser has a relative
+    # tolerance, so it varies the shift and not the large offset (up to 1e9 s)
     shifts_s = half_width_s * np.linspace(-1.0, 1.0, 21)
     best_index = int(np.argmin([compute_cost(shift_s) for shift_s in shifts_s]))
-    shift_bounds_s = shifts_s[max(best_index - 1, 0)], shifts_s[min(best_index + 1, 20)]
-    return make_fit(float(minimize_scalar(compute_cost, bounds=shift_bounds_s, method="bounded").x))
+    neighbours = np.clip([best_index - 1, best_index + 1], 0, len(shifts_s) - 1)
+    optimum = minimize_scalar(compute_cost, bounds=shifts_s[neighbours], method="bounded")
+    return make_fit(float(optimum.x))

@@ -104,16 +104,19 @@ def _test_edge(
         int(graph.ids[graph.first_nodes[edge_index]]),
         int(graph.ids[graph.second_nodes[edge_index]]),
     )
+    # A closure can measure only some directions of the relative pose, for example no rotation.
+    # Project the residual and its covariance by odometry on these directions
     directions, closure_variance = model.compute_observed_directions(graph.information[edge_index])
     degrees_of_freedom = len(closure_variance)
     projected_residual = directions.T @ residual
     residual_covariance = directions.T @ covariance @ directions + np.diag(closure_variance)
-    is_testable = degrees_of_freedom and np.isfinite(residual_covariance).all()
-    if (
-        not is_testable
-        or np.linalg.eigvalsh(model.scale_to_unit_diagonal(residual_covariance)[1])[0]
-        <= _MIN_COVARIANCE_EIGENVALUE
-    ):
+    is_testable = degrees_of_freedom > 0 and np.isfinite(residual_covariance).all()
+    if is_testable:
+        # The covariance must not be singular within rounding errors
+        _, scaled_covariance = model.scale_to_unit_diagonal(residual_covariance)
+        min_eigenvalue = np.linalg.eigvalsh(scaled_covariance)[0]
+        is_testable = min_eigenvalue > _MIN_COVARIANCE_EIGENVALUE
+    if not is_testable:
         raise TrajectoryError(
             f"The closure from vertex {vertices[0]} to {vertices[1]} cannot be tested: its "
             "information matrix is zero, or differs by many orders of magnitude from the odometry",

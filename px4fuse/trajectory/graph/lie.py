@@ -130,24 +130,20 @@ def right_jacobian_inverse(tangent: Array) -> Array:
     tangent : ndarray, shape (..., 3) or (..., 6)
         Tangent vectors with a rotation below 2 pi.
     """
-    lie_bracket_matrix = _make_lie_bracket_matrix(tangent)
-    lie_bracket_matrix_squared = lie_bracket_matrix @ lie_bracket_matrix
+    # The Jacobian is the power series x / (1 - exp(-x)) = 1 + x/2 + x^2/12 - x^4/720 + ... of the
+    # Lie bracket matrix x = ad. The identity ad^5 = -2 theta^2 ad^3 - theta^4 ad replaces the
+    # higher powers, so the series is a polynomial 1 + x/2 + a x^2 + b x^4. By the identity, the
+    # eigenvalues of ad are 0 and, twice, +-i theta. At +-i theta, the polynomial has the value and
+    # the derivative of the series. These two equations give a = f - theta f'/2 and
+    # b = -f'/(2 theta), with the function f of _compute_square_term_factor
+    ad = _make_lie_bracket_matrix(tangent)
+    ad_squared = ad @ ad
     theta = np.linalg.norm(tangent[..., _get_dimension(tangent) :], axis=-1)[..., None, None]
-    square_term_factor = _compute_square_term_factor(theta)
     half_derivative_over_theta = 0.5 * _compute_square_term_derivative_over_theta(theta)
-    # With the Lie bracket matrix x = ad, the inverse right Jacobian is x / (1 - exp(-x)) = 1 + x/2
-    # + a x^2 + b x^4. Higher powers of x are not needed, because ad^5 = -2 theta^2 ad^3 - theta^4
-    # ad. The factors are a = f - theta f'/2 and b = -f'/(2 theta), with f =
-    # _compute_square_term_factor(theta)
-    jacobian: Array = (
-        np.eye(lie_bracket_matrix.shape[-1])
-        + 0.5 * lie_bracket_matrix
-        + (square_term_factor - theta * theta * half_derivative_over_theta)
-        * lie_bracket_matrix_squared
-    )
-    return jacobian - half_derivative_over_theta * (
-        lie_bracket_matrix_squared @ lie_bracket_matrix_squared
-    )
+    a = _compute_square_term_factor(theta) - theta * theta * half_derivative_over_theta
+    b = -half_derivative_over_theta
+    jacobian: Array = np.eye(ad.shape[-1]) + 0.5 * ad + a * ad_squared
+    return jacobian + b * (ad_squared @ ad_squared)
 
 
 def _make_lie_bracket_matrix(tangent: Array) -> Array:
@@ -192,6 +188,9 @@ def accumulate_poses(steps: Array) -> Array:
     ----------
     steps : ndarray, shape (n, 3) or (n, 7)
     """
+    # Prefix products by doubling: each row is the product of the last 1, 2, 4, ... motions up to
+    # it. A round multiplies it by the row composed_count before, which contains the motions before.
+    # compose returns a new array, so all rows of a round use the rows of the round before
     poses = np.vstack([identity(steps.shape[-1]), steps])
     composed_count = 1
     while composed_count < len(poses):

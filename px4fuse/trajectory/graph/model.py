@@ -53,16 +53,11 @@ class PoseGraph:
         edge_fields = ("first_nodes", "second_nodes", "measurements", "information")
         return replace(self, **{name: getattr(self, name)[is_selected] for name in edge_fields})
 
-    @property
-    def degrees_of_freedom(self) -> int:
-        """Degrees of freedom of a pose: 3 in the plane, 6 in space."""
-        return 3 if self.dimension == 2 else 6
-
     @cached_property
     def normal_equations(self) -> NormalEquations:
         """Normal equations of the poses, with the first pose fixed."""
         edges = np.stack([self.first_nodes, self.second_nodes])
-        return NormalEquations(edges, self.degrees_of_freedom)
+        return NormalEquations(edges, self.information.shape[-1])
 
     def find_successive_edges(self) -> BoolArray:
         """Return a mask of the edges between successive poses."""
@@ -206,8 +201,10 @@ def _compute_chordal_poses(graph: PoseGraph) -> PoseGraph:
     require_connected(graph, rotation_information > 0.0, "edges that measure a rotation")
     measured_rotation = lie.rotation_matrix(graph.measurements)
     eye = np.broadcast_to(np.eye(dimension), measured_rotation.shape)
-    # Linear least squares for the rotation matrix R_i of each pose. With the measured rotation Z of
-    # each edge (i, j), minimise the weighted sum of |Zᵀ R_iᵀ - R_jᵀ|²
+    # 1. Rotations. An edge (i, j) with measured rotation Z states R_j = R_i Z. Without the
+    # condition that R_i is a rotation, this is linear in R_i: minimise the sum of |Zᵀ R_iᵀ -
+    # R_jᵀ|², weighted by the trace of the rotation information. Then replace each matrix by the
+    # nearest rotation
     transposed_matrices = _solve_positions(
         graph,
         first_pose_matrix=measured_rotation.transpose(0, 2, 1),
@@ -217,7 +214,9 @@ def _compute_chordal_poses(graph: PoseGraph) -> PoseGraph:
         first_pose=lie.rotation_matrix(graph.poses[0]).T,
     )
     rotation = _find_nearest_rotations(transposed_matrices.transpose(0, 2, 1))
-    # Residual of an edge with rotation Z and translation z: (R_i Z)ᵀ (t_j - t_i - R_i z)
+    # 2. Positions, with these rotations fixed. An edge with rotation Z, translation z and
+    # information W has the residual (R_i Z)ᵀ (t_j - t_i - R_i z), so t_j - t_i - R_i z has the
+    # information (R_i Z) W (R_i Z)ᵀ
     first_rotation = rotation[graph.first_nodes]
     predicted_second_rotation = first_rotation @ measured_rotation
     information = (

@@ -52,6 +52,7 @@ class NormalEquations:
     """
 
     def __init__(self, edges: IntArray, unknowns_per_pose: int) -> None:
+        # Poses are numbered by their position in the order of elimination
         position, eliminated_counts, poses_by_front = _find_elimination_order(
             edges, _MAX_LEAF_UNKNOWNS // unknowns_per_pose
         )
@@ -60,6 +61,7 @@ class NormalEquations:
         # blocks below the diagonal are stored: in the column of the pose that is eliminated first
         columns = np.concatenate([*edge_positions, edge_positions.min(axis=0)])
         rows = np.concatenate([*edge_positions, edge_positions.max(axis=0)])
+        # Number the blocks column by column. Several edges can add to the same block
         blocks, block_indices = np.unique(columns * len(position) + rows, return_inverse=True)
         block_columns, block_rows = np.divmod(blocks, len(position))
 
@@ -77,19 +79,19 @@ class NormalEquations:
             first_pose, remaining_poses = poses[0], poses[eliminated_count:]
             eliminated_range = np.array([first_pose, first_pose + eliminated_count])
             front_blocks = slice(*np.searchsorted(block_columns, eliminated_range))
-            # The parent of a group eliminates the first of its remaining poses. The last group has
-            # no remaining poses and no parent
+            # The parent front eliminates the first of the remaining poses. The last front has no
+            # remaining poses and no parent, so its parent index is not used
             parent_index = int(front_by_pose[remaining_poses[0]]) if len(remaining_poses) else 0
             parent_rows = np.searchsorted(poses_by_front[parent_index], remaining_poses)
             self._fronts.append(
                 _FrontalMatrix(
-                    slice(*eliminated_range * unknowns_per_pose),
-                    enumerate_numbers(remaining_poses, unknowns_per_pose),
-                    front_blocks,
-                    np.searchsorted(poses, block_rows[front_blocks]),
-                    block_columns[front_blocks] - first_pose,
-                    parent_index,
-                    enumerate_numbers(parent_rows, unknowns_per_pose),
+                    unknowns=slice(*eliminated_range * unknowns_per_pose),
+                    remaining_unknowns=enumerate_numbers(remaining_poses, unknowns_per_pose),
+                    blocks=front_blocks,
+                    block_rows=np.searchsorted(poses, block_rows[front_blocks]),
+                    block_columns=block_columns[front_blocks] - first_pose,
+                    parent_index=parent_index,
+                    rows_in_parent=enumerate_numbers(parent_rows, unknowns_per_pose),
                 )
             )
 
@@ -109,6 +111,8 @@ class NormalEquations:
         first_pose_matrix, second_pose_matrix, information, right_hand_side : ndarray
             A, B and weight, shape (m, d, d), and c, shape (m, d, k), of each of the m edges.
         """
+        # An edge with matrices A, B and weight W adds AᵀWA and BᵀWB to the diagonal blocks of its
+        # poses, AᵀWB to their common block, and AᵀWc and BᵀWc to the right-hand sides
         pose_matrices = np.stack([first_pose_matrix, second_pose_matrix])
         weighted_matrices = pose_matrices.swapaxes(2, 3) @ information
         # Off-diagonal block of each edge: rows of the first pose, columns of the second pose.
@@ -117,12 +121,13 @@ class NormalEquations:
         off_diagonal_blocks = weighted_matrices[0] @ second_pose_matrix
         is_first_earlier = np.less(*self._position[self._edges])
         off_diagonal_blocks[is_first_earlier] = off_diagonal_blocks[is_first_earlier].swapaxes(1, 2)
+        # In the order of the rows and columns in __init__: diagonal blocks of the first and of the
+        # second poses, then common blocks. bincount adds the elements of the blocks of all edges
         edge_blocks = [*(weighted_matrices @ pose_matrices), off_diagonal_blocks]
         elements = np.asarray(np.bincount(self._element_indices, np.ravel(edge_blocks)), float)
         matrix_blocks = elements.reshape(-1, *information.shape[1:])
-        matrix_blocks[self._diagonal_blocks[self._position[0]]] += _FIXED_POSE_INFORMATION * np.eye(
-            information.shape[1]
-        )
+        first_pose_block = self._diagonal_blocks[self._position[0]]
+        matrix_blocks[first_pose_block] += _FIXED_POSE_INFORMATION * np.eye(information.shape[1])
         right_hand_sides = np.zeros((len(self._position), *right_hand_side.shape[1:]))
         np.add.at(right_hand_sides, self._edges, weighted_matrices @ right_hand_side)
         return matrix_blocks, right_hand_sides
@@ -137,9 +142,11 @@ class NormalEquations:
         _, unknowns_per_pose, right_hand_side_count = right_hand_sides.shape
         matrix_blocks = matrix_blocks.copy()
         matrix_blocks[self._diagonal_blocks] += damping * np.eye(unknowns_per_pose)
+        # Right-hand sides in the order of elimination, which become the solution
         solution = np.empty_like(right_hand_sides)
         solution[self._position] = right_hand_sides
         solution = solution.reshape(-1, right_hand_side_count)
+        # Schur complements with their rows, by the index of the front to which they are added
         schur_complements = defaultdict[int, list[tuple[IntArray, Array]]](list)
         factors = []
         for index, front in enumerate(self._fronts):
@@ -149,15 +156,18 @@ class NormalEquations:
             # Matrix [[D, Bᵀ], [B, C]] with the eliminated unknowns first. Only the triangle below
             # the diagonal is used
             matrix = np.zeros((row_count, row_count))
+            # View of the matrix with the axes block row, row, block column, column
             matrix.reshape(
                 row_count // unknowns_per_pose, unknowns_per_pose, -1, unknowns_per_pose
             )[front.block_rows, :, front.block_columns] = matrix_blocks[front.blocks]
             for rows, schur_complement in schur_complements.pop(index, ()):
                 matrix[rows[:, None], rows] += schur_complement
-            # Cholesky factor U of D = UᵀU
+            # Cholesky factor U of D = UᵀU. LAPACK and BLAS use the triangle above the diagonal of
+            # the transposed matrix, which is in Fortran order
             cholesky_factor, failed_row = lapack.dpotrf(matrix[:size, :size].T)
             if failed_row:
                 return None
+            # Forward substitution: solve Uᵀ y = right-hand side
             solution[unknowns] = blas.dtrsm(1.0, cholesky_factor, solution[unknowns], trans_a=1)
             off_diagonal_factor = matrix[size:, :size].T
             if len(remaining_unknowns):
@@ -173,7 +183,7 @@ class NormalEquations:
                 )
                 solution[remaining_unknowns] -= off_diagonal_factor.T @ solution[unknowns]
             factors.append((unknowns, remaining_unknowns, cholesky_factor, off_diagonal_factor))
-        # Back substitution, from the last to the first eliminated unknowns
+        # Back substitution, from the last to the first eliminated unknowns: U x = y - F x_later
         for unknowns, remaining_unknowns, cholesky_factor, off_diagonal_factor in reversed(factors):
             terms_of_solved_unknowns = off_diagonal_factor @ solution[remaining_unknowns]
             solution[unknowns] = blas.dtrsm(
@@ -198,20 +208,24 @@ def _find_elimination_order(
     poses_by_front : list of ndarray of int
         Ascending positions of the poses in each front: those that it eliminates, then others.
     """
+    # Poses are numbered by their index in the sparse order. remaining_poses: see
+    # _build_elimination_tree
     sparse_order = _find_sparse_order(edges)
     remaining_poses, subtree_sizes = _build_elimination_tree(sparse_order[edges])
-    # Each pose is eliminated together with its parent if both are in a small subtree, or if their
-    # columns of the Cholesky factor have the same nonzero rows
+    # Each pose is eliminated in the front of its parent if both are in a small subtree, or if their
+    # columns of the Cholesky factor have the same nonzero rows: those of the pose are its parent
+    # and those of the parent, or fewer. Parents come first, because their number is larger.
+    # last_poses: the last pose of the front of each pose
     last_poses = np.arange(len(sparse_order))
     for pose in reversed(range(len(sparse_order) - 1)):
         parent = min(remaining_poses[pose])
-        if subtree_sizes[parent] <= max_poses_per_leaf_group or (
-            subtree_sizes[pose] > max_poses_per_leaf_group
-            and len(remaining_poses[pose]) == len(remaining_poses[parent]) + 1
-        ):
+        is_in_small_subtree = subtree_sizes[parent] <= max_poses_per_leaf_group
+        is_above_small_subtrees = subtree_sizes[pose] > max_poses_per_leaf_group
+        has_rows_of_parent = len(remaining_poses[pose]) == len(remaining_poses[parent]) + 1
+        if is_in_small_subtree or (is_above_small_subtrees and has_rows_of_parent):
             last_poses[pose] = last_poses[parent]
-    # The groups are eliminated in the order of their last poses. Each group is then eliminated
-    # before its parent, which eliminates the first of its remaining poses
+    # In the order of their last poses, each front is eliminated before its parent. The second
+    # argsort inverts the permutation: from the order of the poses to the position of each pose
     position = np.argsort(np.argsort(last_poses, kind="stable"))
     last_poses, eliminated_counts = np.unique(last_poses, return_counts=True)
     poses_by_front = [
@@ -242,12 +256,13 @@ def _build_elimination_tree(edges: IntArray) -> tuple[list[set[int]], list[int]]
 
     The remaining poses of a pose are the nonzero rows below the diagonal in its column of the
     Cholesky factor: its later neighbours, and the remaining poses of its children. The first of
-    them is its parent.
+    them is its parent. The last pose has no parent.
     """
     remaining_poses: list[set[int]] = [set() for _ in range(int(edges.max()) + 1)]
     for first, second in np.sort(edges, axis=0).T.tolist():
         remaining_poses[first].add(second)
     subtree_sizes = [1] * len(remaining_poses)
+    # A pose is complete when it is reached, because its children have smaller numbers
     for pose in range(len(remaining_poses) - 1):
         parent = min(remaining_poses[pose])
         remaining_poses[parent] |= remaining_poses[pose] - {parent}

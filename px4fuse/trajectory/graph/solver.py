@@ -145,8 +145,9 @@ def _minimise(
     iterations = 0
     cost = float(np.sum(0.5 * weights * residuals.chi2))
     while iterations < max_iterations and cost > _COST_TOLERANCE:
-        # Derivatives of the residual: J by x_j, -J Ad(X_j^-1 X_i) by x_i, with the inverse right
-        # Jacobian J
+        # Linearise the residual r: derivatives J by x_j and -J Ad(X_j^-1 X_i) by x_i, with the
+        # inverse right Jacobian J. The step solves -J Ad x_i + J x_j = -r by least squares, so
+        # ``gradient`` (the right-hand side) is the negative gradient of the cost
         second_pose_jacobian = lie.right_jacobian_inverse(residuals.residual)
         first_pose_jacobian = second_pose_jacobian @ lie.adjoint(
             lie.inverse(residuals.relative_poses)
@@ -157,7 +158,8 @@ def _minimise(
             weights[:, None, None] * graph.information,
             -residuals.residual[..., None],
         )
-        # Increase the damping until a step decreases the cost, or hardly changes it
+        # Increase the damping until a step decreases the cost (accepted), or hardly changes it
+        # (converged). A step is None if the damped matrix is not positive definite
         while True:
             step = graph.normal_equations.solve(matrix_blocks, gradient, damping)
             if step is not None:
@@ -176,7 +178,7 @@ def _minimise(
             if damping >= _MAX_DAMPING:
                 return _Optimum(residuals, iterations, False)
             damping *= _DAMPING_CHANGE_FACTOR
-        if not is_accepted:
+        if not is_accepted:  # the cost is at its minimum, so keep the poses before the step
             return _Optimum(residuals, iterations, True)
         residuals = trial_residuals
         cost -= cost_decrease
@@ -195,8 +197,9 @@ def _solve_gnc(
 ) -> tuple[_Optimum, Array]:
     """Reject false closures by graduated non-convexity; return the optimum and the edge weights."""
     # Both limits are quantiles of the χ² distribution. A closure with χ² below chi2_bound keeps the
-    # weight 1. In the truncated cost, cost_if_dropped replaces the χ² of a dropped closure.
-    # Odometry edges are never dropped
+    # weight 1 in the search for the weights. Solutions are compared by their truncated cost: a
+    # dropped closure adds cost_if_dropped, a larger quantile, so that a closure is dropped only if
+    # its χ² is clearly too large. Odometry edges are never dropped
     half_degrees_of_freedom = model.count_observed_directions(graph.information) / 2.0
     chi2_bound = np.where(
         can_be_false_closure & (half_degrees_of_freedom > 0.0),
@@ -238,13 +241,16 @@ def _run_gnc(
     """Run graduated non-convexity from one start (Yang 2020, algorithm 1, eq. 13 and 14)."""
     residuals = start_residuals
     iteration_count = 0
-    # Initial control parameter of graduated non-convexity: 1 ÷ maximum of 2 χ² / chi2_bound - 1
-    # over all edges (Yang 2020, section V)
-    inverse_control_parameter_by_edge = 2.0 * residuals.chi2 / chi2_bound - 1.0
-    if np.max(inverse_control_parameter_by_edge) > 0.0:
-        control_parameter = 1.0 / float(np.max(inverse_control_parameter_by_edge))
+    # 1. Minimise a cost that is nearly convex at first, and truncated at chi2_bound at last: the
+    # control parameter increases in each stage, until all weights are 0 or 1. Initial control
+    # parameter: the inverse of the maximum over all edges (Yang 2020, section V)
+    inverse_control_parameter = float(np.max(2.0 * residuals.chi2 / chi2_bound - 1.0))
+    if inverse_control_parameter > 0.0:
+        control_parameter = 1.0 / inverse_control_parameter
         for _ in range(_MAX_GNC_STAGES):
-            # avoid a division by zero
+            # Weights (Yang 2020, eq. 14): 1 for small χ², 0 for large χ², and between them
+            # √(μ (μ + 1) bound / χ²) - μ, with the control parameter μ. The lower limit avoids a
+            # division by zero
             chi2_ratio = np.maximum(residuals.chi2 / chi2_bound, 1e-200)
             weights = np.clip(
                 np.sqrt(control_parameter * (control_parameter + 1.0) / chi2_ratio)
@@ -257,9 +263,10 @@ def _run_gnc(
             )
             residuals = stage_optimum.residuals
             iteration_count += stage_optimum.iterations
-            if np.all((weights < 1e-6) | (weights > 1.0 - 1e-6)):
+            if np.all((weights < 1e-6) | (weights > 1.0 - 1e-6)):  # all are 0 or 1
                 break
             control_parameter *= _GNC_CONTROL_FACTOR
+    # 2. Use the edges below the bound with full weight, and repeat until the selection is final
     weights = (residuals.chi2 <= chi2_bound).astype(float)
     for _ in range(_MAX_REWEIGHTING_ROUNDS):
         reweighted_optimum = _minimise(graph, residuals, weights)
@@ -323,6 +330,7 @@ def analyse_graph(
         The graph is not connected.
     """
     closure_edges = np.flatnonzero(~graph.find_successive_edges())
+    # 1. Solve with all closures, and test the fit: reduced χ² with its expected 95 % interval
     progress(f"optimising: {SOLUTION_LABELS['all']}")
     solutions = {"all": solve(graph)}
     degrees_of_freedom = int(model.count_observed_directions(graph.information).sum())
@@ -333,13 +341,15 @@ def analyse_graph(
         reduced_chi2_interval = tuple(
             (chdtri(degrees_of_freedom, [0.975, 0.025]) / degrees_of_freedom).tolist()
         )
+    # 2. Test each closure against odometry
     scaled_graph, information_factor = graph, 1.0
     closure_tests: tuple[GateResult, ...] | Unavailable
     try:
         closure_tests = tuple(gate_edges(graph, closure_edges))
-        # If the information matrices of the edges seem too large, divide them by a factor, and test
-        # the closures again. The factor is the smaller of two estimates (reduced χ², median χ² of
-        # the closures): false closures enlarge only the reduced χ²
+        # If the information matrices seem too large, divide them by the factor and test again. The
+        # factor has two estimates: the reduced χ², and the median ratio of d² of the closures to
+        # its expected median. False closures enlarge the reduced χ² only, so the smaller estimate
+        # is used
         if (
             reduced_chi2 > reduced_chi2_interval[1]
             and len(closure_tests) >= MIN_CLOSURES_FOR_SCALE_FACTOR
@@ -353,6 +363,7 @@ def analyse_graph(
         closure_tests = Unavailable(
             "gate", str(error), "Give an odometry edge between all successive vertices."
         )
+    # 3. Solve again without false closures
     if use_robust_optimisation is None:
         use_robust_optimisation = len(closure_edges) <= MAX_GNC_CLOSURES
     if use_robust_optimisation and len(closure_edges) > 1:
