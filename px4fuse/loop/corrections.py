@@ -257,7 +257,7 @@ def distribute_closure_error_by_distance(
     # The closure between take-off and landing, if any, is the first
     if closures and closures[0].source == LANDING_CLOSURE_SOURCE and not closures[0].accepted:
         closure_error_vector_m = _explain_gate_rejection(
-            "path correction in proportion to distance flown", closures[0]
+            "path correction in proportion to path length", closures[0]
         )
     if isinstance(closure_error_vector_m, Unavailable):
         return {"by_distance_plain": closure_error_vector_m, "by_distance": closure_error_vector_m}

@@ -33,6 +33,7 @@ from px4fuse.ekf2.replay_segments import (
     GRAVITY_M_S2,
     GYRO_BIAS,
     HORIZONTAL_POSITION,
+    HORIZONTAL_VELOCITY,
     STATE_COUNT,
     THETA,
     VELOCITY,
@@ -44,7 +45,6 @@ from px4fuse.ekf2.replay_segments import (
     find_step_ends,
     make_magnetic_field_samples,
 )
-from px4fuse.ekf2.vision import HORIZONTAL_VELOCITY
 from px4fuse.flight.ekf2_parameters import (
     BAROMETER,
     EV_POS,
