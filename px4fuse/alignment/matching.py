@@ -120,7 +120,7 @@ class TrackMatch:
 
     @property
     def residuals_text(self) -> str:
-        """Residuals for messages, such as "ned 0.12 m, enu 3.40 m"."""
+        """RMS residual of the file in each tested frame, such as "ned 0.12 m, enu 3.40 m"."""
         return ", ".join(
             f"{name} {residual_m:.2f} m" for name, residual_m in self.rms_m_by_frame.items()
         )
@@ -273,9 +273,10 @@ def _require_unique_match(match: TrackMatch) -> None:
 def _refit_without_origin_resets(
     flight: Flight, match: TrackMatch, problem: AlignmentProblem
 ) -> TrackMatch:
-    """Fit again to EKF2's position without resets that only moved the origin of its frame.
+    """Repeat the fit to EKF2's position without resets that only moved its origin.
 
-    The first match gives the position of the file at each reset, which is needed to find these.
+    The first fit aligns the position file with EKF2. The aligned positions then show at which
+    resets only the origin of EKF2's frame moved.
     """
     ekf2, fit = flight.ekf2, match.time_offset_fit
     if match.reference.name == IMU_REFERENCE or isinstance(ekf2, Unavailable) or not ekf2.resets:
@@ -302,7 +303,10 @@ def _refit_without_origin_resets(
 def _fit_file_in_frame(
     problem: AlignmentProblem, reference: SampledTrack, frame: str, yaw_rad: float | None
 ) -> TrackFit:
-    """Fit the file in a frame to a reference; estimate the lag if the user gave none."""
+    """Fit the position file, interpreted in the given frame, to a reference track.
+
+    The lag is estimated if the user gave none.
+    """
     file_track = convert_to_ned(problem.samples, frame)
     grid_track = resample_to_grid(remove_spikes(file_track))
     if reference.name == IMU_REFERENCE:

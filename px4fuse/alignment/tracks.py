@@ -1,4 +1,4 @@
-"""Tracks in north, east, down for the alignment: position file, EKF2 position and IMU."""
+"""Tracks (NED) to align a position file with a flight: file, EKF2 position and IMU motion."""
 
 from dataclasses import dataclass, replace
 
