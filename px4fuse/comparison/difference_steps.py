@@ -51,7 +51,8 @@ def explain_ekf2_difference(
 ) -> dict[str, DifferenceExplanation | Unavailable]:
     """Explain the difference between KF and EKF2 along each horizontal axis.
 
-    ``estimate_by_setting`` contains the corrected noises of KF.
+    ``estimate_by_setting`` contains the estimates that replace wrong noise settings of KF (SIGMA_A,
+    SIGMA_Z).
     """
     axis_results = {name: result for name, result in comparison.axes.items() if name != "down"}
     if not axis_results:

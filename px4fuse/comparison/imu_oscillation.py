@@ -1,4 +1,7 @@
-"""Oscillation of the accelerometer that the positions do not contain."""
+"""Oscillation of the measured acceleration that the measured positions do not show.
+
+Such an oscillation is not a motion of the vehicle.
+"""
 
 from typing import NamedTuple
 
@@ -31,7 +34,7 @@ MIN_AMPLITUDE_M_S2 = 0.3
 
 
 class ImuOscillation(NamedTuple):
-    """Frequency and amplitude of an oscillation along one axis of the vehicle."""
+    """Frequency and amplitude of an oscillating acceleration error along one vehicle axis."""
 
     frequency_hz: float
     amplitude_m_s2: float
