@@ -1,4 +1,4 @@
-"""Configurations of the EKF2 model, and several of them in arrays for one computation."""
+"""Filter configurations of the EKF2 replay, and batches of them that are replayed at once."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -62,7 +62,8 @@ class FilterConfiguration:
     def can_use_logged_bad_acceleration_flag(self, inputs: ReplayInputs) -> bool:
         """Return True if EKF2's logged bad-acceleration flag is valid for this configuration.
 
-        The flag depends on the height parameters.
+        EKF2 computes the flag from vertical innovations. It is valid if the configuration uses the
+        logged decisions, or changes nothing that has an effect on vertical innovations.
         """
         has_logged_height_parameters = not self.disable_time_s_by_aid and all(
             value == inputs.settings[name]

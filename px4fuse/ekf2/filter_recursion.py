@@ -242,7 +242,11 @@ def run_segment(  # noqa: PLR0912, PLR0915 (the order of EKF2's fusions in one p
 
 
 class _Prediction:
-    """Prediction from one event to the next: x = Φx + u, P = ΦPΦ' + Q."""
+    """Prediction of state and covariance from one fusion event to the next.
+
+    x = Φx + u and P = ΦPΦ' + Q. The vector u is the state change by acceleration and attitude
+    correction.
+    """
 
     def __init__(self, batch: FilterBatch, bad_acceleration_flag: BadAccelerationFlag) -> None:
         self.batch, self.bad_acceleration_flag = batch, bad_acceleration_flag
@@ -265,7 +269,7 @@ class _Prediction:
         self.bias_noise_per_step, self.max_variance_with_noise = _compute_bias_noise(batch)
 
     def _prepare_transitions(self, events: slice) -> None:
-        """Compute Φ, u and Q of several events at once."""
+        """Compute Φ, u and Q of the predictions to several fusion events at once."""
         batch = self.batch
         transitions = {one: one.compute_transitions(events) for one in set(batch.intervals)}
         (
@@ -288,7 +292,10 @@ class _Prediction:
         )
 
     def predict(self, event: int, x: Array, P: Array) -> None:
-        """Predict x and P at an event in place; call this method in order of events."""
+        """Predict x and P from the previous fusion event to this one, in place.
+
+        Call this method in the order of the events.
+        """
         row = event % EVENT_BATCH_SIZE
         if row == 0:
             self._prepare_transitions(slice(event, event + EVENT_BATCH_SIZE))
@@ -376,7 +383,10 @@ class _PositionFusion:
         self.reset_m = np.zeros((*events.shape, 2))
 
     def test_and_fuse_gnss(self, event: int, x: Array, P: Array) -> ArrayPair:
-        """Test the sample of an event with the gate, and fuse it if it is from GNSS."""
+        """Test the sample of a fusion event with the gate, and fuse it if it is from GNSS.
+
+        A sample consists of position and, from GNSS, velocity.
+        """
         batch, R = self.batch, self.measurement_variance[event]
         nu = self.measured_values[event] - x[:, VELOCITY_AND_POSITION]
         S = _get_state_variances(P)[:, VELOCITY_AND_POSITION] + R
@@ -457,7 +467,10 @@ class _PositionFusion:
         return x, P
 
     def reset_states(self, event: int, x: Array, P: Array) -> None:
-        """Set the states of filters with a reset to the measurement, in place."""
+        """Set the states to the measurement, in place.
+
+        Only filter configurations that reset their states in this fusion event are changed.
+        """
         rules, is_reset = self.batch.inputs.rules, self.reset[event]
         resets = [(HORIZONTAL_POSITION, HORIZONTAL_POSITION_COLUMNS, rules.reset_variance_factor)]
         if self.has_velocity and rules.resets_velocity:
@@ -470,7 +483,10 @@ class _PositionFusion:
         )
 
     def get_velocity_down_update(self, event: int) -> Array:
-        """Return ν and S of the vertical velocity, shape (2, filters); NaN if it is not fused."""
+        """Return ν and S of the vertical GNSS velocity in a fusion event; NaN if not fused.
+
+        The shape is (2, filters), with one column for each filter configuration.
+        """
         update = [
             values[event, :, VELOCITY_DOWN_COLUMN]
             for values in (self.innovation, self.innovation_variance)
@@ -506,7 +522,7 @@ def _make_bad_acceleration_flag(batch: FilterBatch) -> BadAccelerationFlag:
 
 
 def _stack_by_filter(tuples_by_filter: Sequence[tuple[Array, ...]]) -> list[Array]:
-    """Stack the arrays of all filters along axis 1."""
+    """Stack the arrays of all filter configurations along axis 1; axis 0: fusion events."""
     return [np.stack(arrays, axis=1) for arrays in zip(*tuples_by_filter, strict=True)]
 
 
@@ -550,19 +566,21 @@ def _update_sequentially(
 class _FusionDecisions:
     """Decisions on each position sample: reject it, fuse it, or reset the position to it.
 
-    EKF2 resets the position after a time without fusion. After several resets, EKF2 stops fusion.
+    Several filter configurations are computed at once. Each fusion event has at most one position
+    sample. EKF2 resets the position after a time without fusion. After several resets, EKF2 stops
+    fusion.
 
     Source: updateEvPosFusion, startEvPosFusion (``ev_pos_control.cpp``).
 
     Parameters
     ----------
     action : ndarray of int, shape (events, filters)
-        Action of each filter on the sample if it is inside the gate.
+        Action of each filter configuration on the sample if it is inside the gate.
 
     Attributes
     ----------
     logged_rejected_flags, logged_resets : ndarray, shape (events,)
-        EKF2's logged decisions; NaN for an unknown rejection.
+        Rejections and resets in the log; NaN for an unknown rejection.
     last_position_s, last_velocity_s : ndarray, shape (filters,)
         Time of the last fusion or reset.
     """
@@ -633,7 +651,11 @@ class _FusionDecisions:
         return is_rejected, is_fused, is_reset, is_velocity_fused & ~is_reset
 
     def _find_rejected(self, event: int, is_outside_gate: BoolArray) -> BoolArray:
-        """Return True for filters that reject the sample, by the log or by the gate."""
+        """Return True for each filter configuration that rejects the sample of a fusion event.
+
+        Configurations that use logged decisions reject the sample if EKF2 rejected it in the log.
+        The others reject samples outside the gate.
+        """
         logged_flag = self.logged_rejected_flags[event]
         if not math.isnan(logged_flag):
             return np.asarray(
@@ -653,7 +675,10 @@ class _FusionDecisions:
         return np.asarray(is_outside_gate & ~is_fused_in_log)
 
     def _is_timed_out(self, now_s: Array) -> BoolArray:
-        """Return True for filters that reset the position at the next rejection."""
+        """Return True for each filter configuration whose last fusion is too long ago.
+
+        Such a configuration resets the position at the next rejection.
+        """
         fusion_rules = self.fusion_rules
         # Releases that reset velocity and position together wait longer while velocity is fused
         is_velocity_fused = now_s - self.last_velocity_s <= fusion_rules.reset_timeout_s
@@ -783,7 +808,11 @@ def _limit_bias_variance(P: Array, lower_limit_m2_s4: float, estimates_biases: B
 
 
 def _collect_measurements(batch: FilterBatch) -> ArrayPair:
-    """Return measurements and variances, shape (events, filters, 6): velocity, position (NED)."""
+    """Return the measurements of the position source in each fusion event, with variances.
+
+    The shape is (events, filters, 6), with one column for each filter configuration. The last axis
+    is velocity (m/s), then position (m), both in NED.
+    """
     inputs, segment, parameters = batch.inputs, batch.segment, batch.parameters
     received_positions, aid, event_steps = inputs.received_positions, inputs.aid, batch.event_steps
     samples = np.maximum(batch.events["sample"], 0)

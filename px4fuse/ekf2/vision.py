@@ -131,9 +131,9 @@ class VisionFilter:
         self.was_gnss_off = self.is_gnss_off[0]
 
     def make_update_table(self, configuration_index: int, end_s: Array) -> pd.DataFrame:
-        """Return a table of one configuration's vision updates, one row per sample.
+        """Return a table of the vision updates of a filter configuration, one row per sample.
 
-        ``end_s`` contains the time (s) of each event.
+        ``end_s`` contains the time (s) of each fusion event.
         """
         return make_update_table(
             self.update_records[..., configuration_index],
