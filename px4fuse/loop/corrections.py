@@ -369,7 +369,8 @@ def _correct_path(
 ) -> tuple[Trajectory, Solution]:
     """Correct each pose of a path by interpolation of the corrections of the graph nodes.
 
-    Return the corrected path with its solution.
+    ``graph_poses`` are the node poses before, ``solution`` those after optimisation. Return the
+    corrected path with the unchanged solution.
     """
     solved_poses = solution.poses
     node_corrections = (
