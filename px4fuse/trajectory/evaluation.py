@@ -571,7 +571,11 @@ def _move_to_reference_body(
 def _rotate_to_reference_body(
     aligned_estimate: Trajectory, reference: Trajectory
 ) -> tuple[Trajectory, tuple[str, ...]]:
-    """Remove the constant rotation between camera and vehicle axes, and return a note."""
+    """Rotate the body axes of the estimate to those of the reference, if one has camera axes.
+
+    The constant rotation between camera and vehicle axes is estimated. Return also a note on this
+    rotation for the user, or no note.
+    """
     # The body axes differ if only one trajectory is in a camera frame, or if one is from SLAM
     # (camera axes) and the other one is in a frame of vehicles
     vehicle_frames = (*_Z_DOWN_FRAMES, "ENU")
