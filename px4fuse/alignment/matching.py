@@ -167,7 +167,7 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> TrackMatch | None:
 
 
 def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) -> TrackMatch:
-    """Return the match with the reference that has the smallest residual."""
+    """Match the file with each reference; return the match with the smallest residual."""
     samples = problem.samples
     if samples.index[-1] - samples.index[0] > MAX_FILE_DURATION_S:
         raise NoMatchError(
@@ -190,9 +190,9 @@ def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) 
 def _match_with_reference(
     reference: SampledTrack, frames: tuple[str, ...], problem: AlignmentProblem
 ) -> TrackMatch:
-    """Fit the file in each frame to a reference, and test the yaw from the user.
+    """Fit the position file, in each possible frame, to a reference, and test the user's yaw.
 
-    The yaw is wrong if only the fit with an estimated yaw is acceptable, or much better.
+    The user's yaw is wrong if only the fit with an estimated yaw is acceptable, or much better.
     """
     yaw_rad = problem.yaw_rad
     fits = [(_fit_file_in_frame(problem, reference, frame, yaw_rad), frame) for frame in frames]
@@ -218,7 +218,7 @@ def _match_with_reference(
 def needs_rotation(
     horizontal_rms_m: float, fit_with_estimated_yaw: TrackFit, reference: str
 ) -> bool:
-    """Return True if estimating the yaw reduces the horizontal residual (m) much."""
+    """Return True if the fit with estimated yaw has a much smaller horizontal residual (m)."""
     return (
         horizontal_rms_m
         > MIN_RESIDUAL_RATIO_OF_GIVEN_TO_ESTIMATED_YAW * fit_with_estimated_yaw.horizontal_rms_m

@@ -56,7 +56,7 @@ class NoMatchError(Px4FuseError):
 
 @dataclass(frozen=True)
 class SampledTrack:
-    """Positions over time.
+    """Positions (NED) of a position file or of a reference over time.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ def resample_to_grid(track: SampledTrack) -> SampledTrack:
 
 
 def remove_spikes(track: SampledTrack, window_size: int = 3) -> SampledTrack:
-    """Remove outliers with a median filter."""
+    """Remove outliers of the positions with a median filter."""
     return replace(track, position_m=median_filter(track.position_m, size=(window_size, 1)))
 
 

@@ -402,7 +402,7 @@ def _make_card_rerun(rerun: Rerun) -> CardRerun:
 
 
 def _pair_known(before: float | None, after: float | None) -> tuple[float, float] | None:
-    """Return both values, or None if one of them is unknown."""
+    """Return a statistic before and after a change, or None if one value is unknown."""
     return None if before is None or after is None else (before, after)
 
 

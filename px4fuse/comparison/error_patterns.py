@@ -429,7 +429,10 @@ def _fit_least_squares(columns: Array, values: Array) -> tuple[Array, Array]:
 
 
 def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
-    """Return a sinusoidal error that explains most of the slow errors, if any."""
+    """Return a sinusoidal position error that explains most of the time-correlated errors.
+
+    Return None if there is none. The errors are against ground truth.
+    """
     duration_s = fit.time_s[-1] - fit.time_s[0]
     max_frequency_hz = min(MAX_FREQUENCY_HZ, 0.25 / compute_median_interval_s(fit.time_s))
     frequency_step_hz = FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT / duration_s

@@ -41,7 +41,7 @@ class ImuOscillation(NamedTuple):
 
 
 def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | None:
-    """Find an oscillation of the horizontal acceleration that the positions do not contain.
+    """Find an oscillation of the horizontal acceleration that the positions do not show.
 
     Second differences of the positions are compared with those of the doubly integrated
     acceleration, in axes that turn with the heading. Complex numbers are north + i east.

@@ -126,7 +126,10 @@ def _compute_explained_fraction_error(rerun: Rerun, statistic: Statistic) -> flo
 
 
 def brings_inside_limits(rerun: Rerun, statistic: Statistic) -> bool:
-    """Return True if the change brings the mean NIS or mean NEES inside its limits."""
+    """Return True if the mean NIS or mean NEES is inside its limits after the change.
+
+    The limits are the 95 % band of the mean NIS, and 0 to MIN_REPORTED_NEES for the mean NEES.
+    """
     low, high = 0.0, MIN_REPORTED_NEES
     if statistic == "nis":
         low, high = compute_nis_band(rerun.after.innovations)

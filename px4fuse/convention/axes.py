@@ -151,7 +151,10 @@ SIGNED_AXIS_PERMUTATIONS = tuple(
 
 @dataclass(frozen=True)
 class SentPositions:
-    """Positions of a source as sent, and barometer heights (column ``down_m``)."""
+    """Positions in the axes, unit and clock of their source, and heights from the barometer.
+
+    The heights are in column ``down_m`` of ``barometer``.
+    """
 
     time_s: Array
     position_m: Array

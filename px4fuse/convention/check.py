@@ -301,9 +301,10 @@ def _choose_convention(
 def _judge_hypothesis(
     hypothesis: Hypothesis, positions: SentPositions, is_ambiguous: bool
 ) -> ConventionVerdict:
-    """Return the first verdict that applies: not determinable, doubtful, ambiguous, determined.
+    """Return the verdict on the best hypothesis on the axes, unit and delay of a source.
 
-    ``is_ambiguous`` is True if other conventions fit nearly as well.
+    The first of these verdicts that applies is returned: not determinable, doubtful, ambiguous,
+    determined. ``is_ambiguous`` is True if other conventions fit nearly as well.
     """
     if hypothesis.score < MIN_LOG_LIKELIHOOD_GAIN:
         return "not determinable"

@@ -138,8 +138,8 @@ def find_convention_faults(
 def _find_axis_fault_and_rotation(convention: Convention) -> tuple[bool, float]:
     """Return True if the axes are not NED, and the clockwise rotation (°) of the positions.
 
-    The rotation is the one that remains after a conversion of the axes to NED; it is 0 if it is
-    small.
+    The axes are wrong if no rotation about the vertical makes them NED. The rotation is the one
+    that remains after a conversion of wrong axes to NED; it is 0 if it is small.
     """
     rotation_deg, is_z_up = convention.rotation_deg, convention.z == "up"
     is_enu_or_nwu = convention.axes in (FRAME_AXES["ENU"], FRAME_AXES["NWU"])

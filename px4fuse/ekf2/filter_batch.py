@@ -94,7 +94,7 @@ class FilterConfiguration:
 
 
 class FilterBatch:
-    """Filter configurations that are computed at once in one part of a flight, with their events.
+    """Filter configurations that are replayed at once in one part of a flight.
 
     Attributes
     ----------
@@ -102,9 +102,9 @@ class FilterBatch:
     estimates_biases, has_gate, and so on : ndarray of bool, shape (filters,)
         Fields of :class:`FilterConfiguration`.
     events : ndarray, shape (events, filters)
-        Fusions of each filter, see :data:`~px4fuse.ekf2.intervals.EVENT_DTYPE`.
+        Fusion events of each configuration, see :data:`~px4fuse.ekf2.intervals.EVENT_DTYPE`.
     event_steps, event_time_s : ndarray, shape (events, filters)
-        Prediction step of each fusion, and its time.
+        Prediction step of each fusion event, and its time.
     is_enabled_by_aid : dict from PX4's name to ndarray of bool, shape (events, filters)
         True before the aiding source is disabled.
     """

@@ -1,7 +1,8 @@
 """Main loop of the EKF2 model: prediction and fusion in one part of a flight.
 
-Several filter configurations are computed at once. Each event fuses a position. In a gap of the
-position source, an event fuses only height and heading.
+Several filter configurations are computed at once; in shapes, "filters" is their number. Each
+fusion event fuses a position. In a gap of the position source, an event fuses only height and
+heading.
 
 Symbols: x, P: state and covariance; ν: innovation; R: measurement noise; S: innovation variance.
 
@@ -495,7 +496,10 @@ class _PositionFusion:
 
 
 def _average_samples(batch: FilterBatch, aid: Aid, samples: SensorSamples) -> EventSamples:
-    """Return the mean magnetometer or optical flow samples, shape (events, filters)."""
+    """Return the mean magnetometer or optical flow samples of each fusion event.
+
+    The shape is (events, filters), with one column for each filter configuration.
+    """
     mean_samples = EventSamples(
         *_stack_by_filter(
             [average_by_event(batch.segment, samples, steps) for steps in batch.event_steps.T]
@@ -606,9 +610,10 @@ class _FusionDecisions:
     def decide_fusion(
         self, event: int, is_outside_gate: BoolArray, is_velocity_fused: BoolArray
     ) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
-        """Decide for each filter if a position sample is rejected, fused, or used for a reset.
+        """Decide if the position sample of an event is rejected, fused, or used for a reset.
 
-        Return four masks: position rejected, position fused, position reset, velocity fused.
+        Return four masks, with one value for each filter configuration: position rejected, position
+        fused, position reset, velocity fused.
         """
         now_s, action = self.time_s[event], self.sample_actions[event]
         is_reset_logged = self.logged_resets[event]

@@ -36,7 +36,7 @@ MAX_REJECTION_DURATION_S = 1.0
 def _group_vision_by_event(
     batch: FilterBatch, event_steps: IntArray, configuration: FilterConfiguration
 ) -> Array:
-    """Group the vision samples of one filter by event.
+    """Group the vision samples of one filter configuration by fusion event.
 
     Each event fuses the samples since the previous event.
 
@@ -145,7 +145,7 @@ class VisionFilter:
     def fuse(
         self, event: int, x: Array, P: Array, is_after_gnss_fusion: bool, last_gnss_fusion_s: Array
     ) -> ArrayPair:
-        """Fuse the vision samples of one event; return x and P.
+        """Fuse the vision samples of one fusion event; return x and P.
 
         ``is_after_gnss_fusion`` is True for the samples that EKF2 fuses after GNSS.
 
@@ -252,7 +252,8 @@ def set_states(
 ) -> None:
     """Set value and variance of the states ``rows``, and set their correlations to zero.
 
-    Only the selected filters change. ``value`` and ``variance`` have the shape (filters, states).
+    Only the selected filter configurations change. ``value`` and ``variance`` have the shape
+    (filters, states).
     """
     x[is_selected, rows] = value[is_selected]
     P[is_selected, :, rows] = 0.0

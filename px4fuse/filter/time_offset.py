@@ -142,7 +142,7 @@ class SourceTimeOffset(Record, kw_only=True):
 
     @property
     def min_significant_offset_s(self) -> float:
-        """Time offset (s) above which an offset is significant."""
+        """Smallest significant time offset (s)."""
         return max(MIN_TIME_OFFSET_S, self.significance_limit_s)
 
     def is_significant(self, offset_s: float) -> bool:
@@ -261,7 +261,7 @@ def estimate_time_offset(
 
 
 class _LikelihoodCurve(NamedTuple):
-    """-ln p (score) of the positions at time offsets, and an interval (s) around the minimum.
+    """-ln p (score) of the positions at time offsets, and the 95 % interval (s) of the offset.
 
     An end of the interval outside the search range is None.
     """

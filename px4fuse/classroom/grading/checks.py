@@ -246,7 +246,10 @@ class NumberItem(RubricItem, tag="number"):
             )
 
     def _compute_excess(self, number: float) -> float:
-        """Return the distance from the nearer bound to the number; negative within the bounds."""
+        """Return the distance of a number from the nearer bound of this item.
+
+        It is negative within the bounds.
+        """
         return max(self.at_least - number, number - self.at_most)
 
     def _score_number(self, number: float) -> float:
