@@ -66,7 +66,11 @@ class Analysis(Comparison, Estimates, Reruns):
         return model if isinstance(model, Unavailable) else model.baseline_replay
 
     def select_main_reruns(self) -> list[Rerun]:
-        """Return the re-runs along the axis of ``main`` to compare with the original results."""
+        """Return the re-runs along the axis of largest motion, compared with the original run.
+
+        The original run is the logged EKF2 or the first run of KF. Re-runs that are compared with a
+        replay of EKF2 are omitted.
+        """
         main_axis = self.main.axis.name
         return [rerun for rerun in self.reruns if rerun.axis == main_axis and rerun.is_logged]
 

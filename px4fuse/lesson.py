@@ -24,7 +24,7 @@ ODOMETRY_CORNERS_M = ((0.0, 0.0), (20.3, 0.2), (20.6, 20.4), (0.8, 20.9), (1.2, 
 
 
 def run_aisle_example() -> KfRun:
-    """Run KF on Example 1: UWB positions every 0.5 s along an aisle at 1 m/s."""
+    """Run KF on Example 1 of the lesson: UWB positions every 0.5 s along an aisle at 1 m/s."""
     settings = Settings(sigma_a_m_s2=0.5, sigma_z_m=0.10, dt_s=0.1, input="zero")
     time_s = settings.dt_s * np.arange(0.0, PREDICTION_COUNT + 1, PREDICTIONS_PER_UPDATE)
     axis = Axis(
@@ -41,7 +41,7 @@ def run_aisle_example() -> KfRun:
 
 
 def format_kalman_example_lines() -> Iterator[str]:
-    """Yield the lines of Example 1: the state after each UWB update."""
+    """Yield the lines of Example 1 of the lesson: KF's state after each UWB update."""
     kf_run = run_aisle_example()
     for index, state in kf_run.steps.loc[kf_run.updates.index].iterrows():
         time_s = float(str(index))
@@ -54,7 +54,10 @@ def format_kalman_example_lines() -> Iterator[str]:
 
 
 def format_loop_example_lines() -> Iterator[str]:
-    """Yield the lines of Example 2: the loop closure error, and the five corrected corners."""
+    """Yield the lines of Example 2 of the lesson: a loop closure error and its correction.
+
+    The correction changes the five corners of an odometry path.
+    """
     odometry = np.array(ODOMETRY_CORNERS_M)
     distance_m = cumulative_distance(odometry)
     length_m = distance_m[-1]

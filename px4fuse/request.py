@@ -37,7 +37,7 @@ class _BaseRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Base class of the settings of all commands."""
 
     def with_file_names(self) -> Self:
-        """Replace paths by file names."""
+        """Return the settings with file names instead of paths."""
         changes: dict[str, Any] = {
             name: _extract_file_name(path)
             for name in _PATH_FIELDS

@@ -121,7 +121,7 @@ class TrackMatch:
 
     @property
     def residuals_text(self) -> str:
-        """Residuals for messages, such as "ned 0.12 m, enu 3.40 m"."""
+        """RMS residual of the file in each tested frame, such as "ned 0.12 m, enu 3.40 m"."""
         return ", ".join(
             f"{name} {residual_m:.2f} m" for name, residual_m in self.rms_m_by_frame.items()
         )
@@ -165,7 +165,7 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> TrackMatch | None:
 
 
 def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) -> TrackMatch:
-    """Return the match with the reference that has the smallest residual."""
+    """Match the file with each reference; return the match with the smallest residual."""
     samples = problem.samples
     if samples.index[-1] - samples.index[0] > MAX_FILE_DURATION_S:
         raise NoMatchError(
@@ -188,9 +188,9 @@ def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) 
 def _match_with_reference(
     reference: SampledTrack, frames: tuple[str, ...], problem: AlignmentProblem
 ) -> TrackMatch:
-    """Fit the file in each frame to a reference, and test the yaw from the user.
+    """Fit the position file, in each possible frame, to a reference, and test the user's yaw.
 
-    The yaw is wrong if only the fit with an estimated yaw is acceptable, or much better.
+    The user's yaw is wrong if only the fit with an estimated yaw is acceptable, or much better.
     """
     yaw_rad = problem.yaw_rad
     fits = sorted(
@@ -219,7 +219,7 @@ def _match_with_reference(
 def needs_rotation(
     horizontal_rms_m: float, fit_with_estimated_yaw: TrackFit, reference: str
 ) -> bool:
-    """Return True if estimating the yaw reduces the horizontal residual (m) much."""
+    """Return True if the fit with estimated yaw has a much smaller horizontal residual (m)."""
     return (
         horizontal_rms_m
         > MIN_RESIDUAL_RATIO_OF_GIVEN_TO_ESTIMATED_YAW * fit_with_estimated_yaw.horizontal_rms_m
@@ -274,9 +274,10 @@ def _require_unique_match(match: TrackMatch) -> None:
 def _refit_without_origin_resets(
     flight: Flight, match: TrackMatch, problem: AlignmentProblem
 ) -> TrackMatch:
-    """Fit again to EKF2's position without resets that only moved the origin of its frame.
+    """Repeat the fit to EKF2's position without resets that only moved its origin.
 
-    The first match gives the position of the file at each reset, which is needed to find these.
+    The first fit aligns the position file with EKF2. The aligned positions then show at which
+    resets only the origin of EKF2's frame moved.
     """
     ekf2, first_fit = flight.ekf2, match.time_offset_fit
     if match.reference.name == IMU_REFERENCE or isinstance(ekf2, Unavailable) or not ekf2.resets:
@@ -305,7 +306,10 @@ def _refit_without_origin_resets(
 def _fit_file_in_frame(
     problem: AlignmentProblem, reference: SampledTrack, frame: str, yaw_rad: float | None
 ) -> TrackFit:
-    """Fit the file in a frame to a reference; estimate the lag if the user gave none."""
+    """Fit the position file, interpreted in the given frame, to a reference track.
+
+    The lag is estimated if the user gave none.
+    """
     file_track = convert_to_ned(problem.samples, frame)
     grid_track = resample_to_grid(remove_spikes(file_track))
     if reference.name == IMU_REFERENCE:

@@ -398,9 +398,10 @@ def _compare_with_ekf2(
 def _find_frame_conflict(
     match: TrackMatch, distance_to_ekf2_m: Array | None, yaw_rad: float
 ) -> Iterator[str]:
-    """Describe a frame that is rotated against the reference; nothing without such a rotation.
+    """Describe a rotation of the file's frame relative to the reference; nothing without one.
 
-    EKF2 shows rotation and origin of the frame, the IMU only the rotation.
+    With ``distance_to_ekf2_m``, the origin of the frame is compared with EKF2's origin, too. A
+    match with the IMU gives only the rotation.
     """
     reference_name, fit = match.reference.name, match.fit_with_estimated_yaw
     yaw_deg = np.degrees(np.angle(np.exp(1j * (fit.yaw_rad - yaw_rad))))

@@ -226,7 +226,10 @@ def fit_by_least_squares(
     is_fitted = np.array([True, True, is_lag_estimated, yaw_rad is None])
 
     def compute_residuals_m(fitted_parameters: Array) -> Array:
-        """Return the residuals north and east of each position in turn."""
+        """Return aligned file position minus reference position (m), north and east in turn.
+
+        ``fitted_parameters`` are trial values of the parameters in ``is_fitted``.
+        """
         all_parameters = parameters.copy()
         all_parameters[is_fitted] = fitted_parameters
         origin_north_m, origin_east_m, lag_correction_s, fitted_yaw_rad = all_parameters
@@ -288,7 +291,10 @@ def fit_by_least_squares(
 
 
 def _fit_vertical(down_difference_m: Array) -> tuple[float, float]:
-    """Return the vertical origin (m, down) and the RMS residual (m); zero without heights."""
+    """Return the vertical origin of the file's frame (m, down) and the RMS of the residuals.
+
+    Both are zero without heights.
+    """
     down_difference_m = down_difference_m[np.isfinite(down_difference_m)]
     if not len(down_difference_m):
         return 0.0, 0.0
@@ -297,7 +303,7 @@ def _fit_vertical(down_difference_m: Array) -> tuple[float, float]:
 
 
 def _compute_parameter_sigma(jacobian: Array, residuals_m: ComplexArray) -> Array:
-    """Return the standard deviations of the fitted parameters."""
+    """Return σ of the fitted origin, lag and yaw, from Jacobian and residuals of their fit."""
     information = jacobian.T @ jacobian
     # The added diagonal prevents a singular matrix
     information += 1e-9 * np.diag(np.diag(information) + 1e-12)

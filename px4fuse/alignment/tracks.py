@@ -1,4 +1,4 @@
-"""Tracks in north, east, down for the alignment: position file, EKF2 position and IMU."""
+"""Tracks (NED) to align a position file with a flight: file, EKF2 position and IMU motion."""
 
 from dataclasses import dataclass, replace
 
@@ -60,7 +60,7 @@ class AmbiguousMatchError(NoMatchError):
 
 @dataclass(frozen=True)
 class SampledTrack:
-    """Positions over time.
+    """Positions (NED) of a position file or of a reference over time.
 
     Attributes
     ----------
@@ -109,7 +109,7 @@ def resample_to_grid(track: SampledTrack) -> SampledTrack:
 
 
 def remove_spikes(track: SampledTrack, window_size: int = 3) -> SampledTrack:
-    """Remove outliers with a median filter."""
+    """Remove outliers of the positions with a median filter."""
     return replace(track, position_m=median_filter(track.position_m, size=(window_size, 1)))
 
 

@@ -264,7 +264,10 @@ def collect_compared_numbers(results: Results) -> dict[str, ComparedNumber]:
 
 
 def _find_matching_paths(results: Results, pattern: str) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield the paths in the results that match a pattern, with the keys that replace ``*``."""
+    """Yield the field paths in the results that match a pattern with ``*`` in place of keys.
+
+    Each path is returned with the keys that replace ``*``.
+    """
     parent, wildcard, pattern_end = pattern.partition(".*")
     if not wildcard:
         yield pattern, ()

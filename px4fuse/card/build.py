@@ -325,7 +325,10 @@ def _describe_effect(
 def _describe_position_errors(
     analysis: Analysis, effect: FlightErrors, sigma_verdicts: Sequence[Verdict]
 ) -> list[str]:
-    """Describe the errors against ground truth."""
+    """Describe the position errors of KF and EKF2 against ground truth.
+
+    The errors are given as RMSE, and as a multiple of the reported σ for inconsistent filters.
+    """
     segment, flight, span_text = analysis.segment, analysis.segment.whole_flight, ""
     if max(segment.start_s - flight.start_s, flight.end_s - segment.end_s) > MIN_GAP_S:
         span_text = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s"
@@ -345,7 +348,10 @@ def _describe_position_errors(
 
 
 def _describe_worst_axis(analysis: Analysis) -> list[str]:
-    """State EKF2's error along another axis if it is overconfident there, more than along main."""
+    """State EKF2's position error along a secondary axis if EKF2 is most overconfident there.
+
+    Secondary axes are all axes except the axis of largest motion.
+    """
 
     def compute_error_to_sigma_ratio(result: AxisComparison) -> float:
         # An axis with ratio 0 is not described: EKF2's errors against ground truth are unknown or,

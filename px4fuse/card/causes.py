@@ -137,7 +137,11 @@ def _find_cause_rank(finding: Finding, reruns: Iterable[Rerun]) -> int:
 
 
 def find_reruns_of_finding(reruns: Iterable[Rerun], finding: Finding) -> tuple[Rerun, ...]:
-    """Return the best re-run of each filter and kind of change that tests a finding."""
+    """Return the best re-run for each filter and each kind of change that tests a finding.
+
+    The best re-runs make the filter consistent, see
+    :func:`~px4fuse.comparison.rerun_effects.compute_preference_key`.
+    """
     tested_change_kinds = FINDING_CATALOGUE[finding.id].rerun_kinds
     tested_change_kinds |= {"defaults"} if "noises" in tested_change_kinds else set()
     best_rerun_by_filter_and_kind: dict[tuple[FilterName, str], Rerun] = {}
@@ -205,9 +209,10 @@ def _make_actions(
     sigma_verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
-    """Return groups of alternative actions, and further actions.
+    """Return the actions against a cause: alternative groups of actions, and further actions.
 
-    The user takes all actions of one group, and all further actions.
+    The user chooses one of the groups and takes all its actions. All further actions are necessary,
+    too.
     """
     finding = ranked_cause.finding
     rerun_by_filter_and_kind = {(rerun.filter, rerun.kinds[0]): rerun for rerun in useful_reruns}
@@ -286,7 +291,12 @@ def _make_sender_actions(
     offset_rerun: Rerun | None,
     request: ComparisonRequest,
 ) -> list[Action]:
-    """Return the action on the position source, or on the delay of GNSS in EKF2."""
+    """Return the action against a cause, except changes of delay and noise after a re-run.
+
+    - Time offset: shift the timestamps by the time offset of ``offset_rerun``.
+    - Wrong EKF2_GPS_DELAY without re-run: set the parameter to its estimate.
+    - Other faults: the action of the finding, if it has one.
+    """
     finding, source, model = ranked_cause.finding, analysis.source, analysis.ekf2_model
     # users cannot shift the timestamps of a GNSS receiver: for GNSS, the action is the remedy of
     # the finding, if the finding has one
@@ -392,7 +402,7 @@ def _make_card_rerun(rerun: Rerun) -> CardRerun:
 
 
 def _pair_known(before: float | None, after: float | None) -> tuple[float, float] | None:
-    """Return both values, or None if one of them is unknown."""
+    """Return a statistic before and after a change, or None if one value is unknown."""
     return None if before is None or after is None else (before, after)
 
 

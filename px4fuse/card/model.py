@@ -52,7 +52,8 @@ class Verdict(Record, kw_only=True):
         "consistent", "overconfident" (reported σ too small), "underconfident" (too large), or
         "not evaluated" with a ``reason``.
     is_explained : bool
-        True if an inconsistent filter needs no change of its settings.
+        True if an inconsistent filter needs no change of its settings, for example because it is
+        consistent against ground truth.
     """
 
     filter: FilterName
@@ -104,8 +105,8 @@ class Action(Record):
     target : str
         Device or filter to be changed.
     sentence : str
-        The action as an imperative. Otherwise, the reason why there is no action, which begins with
-        "keep the settings" or "no".
+        Action as an imperative. If no action is recommended: the reason, which begins with "keep
+        the settings" or "no".
     where : {"shell", "console", ""}
         Program for the commands: shell of the computer, or MAVLink console of the vehicle.
     """
@@ -244,7 +245,7 @@ class AidConsistency(Record, kw_only=True):
 
 
 class DiagnosisCard(Record, kw_only=True):
-    """Diagnosis of a flight: headline, errors, recommended actions, filter consistency and causes.
+    """Diagnosis of a flight: headline, errors, actions, filter consistency and causes.
 
     Attributes
     ----------
@@ -253,9 +254,11 @@ class DiagnosisCard(Record, kw_only=True):
     verdicts : tuple of Verdict
         Consistency of KF and EKF2.
     reconcile : str
-        Explanation if the verdicts against position source and ground truth differ.
+        Explanation if the verdict from innovations differs from that from errors against ground
+        truth.
     difference : str
-        Position difference KF - EKF2, before and after the first cause is corrected.
+        RMS position difference KF - EKF2 and, if a re-run without the first fault exists, the RMS
+        difference after this re-run.
     more_causes : int
         Number of causes omitted from ``causes``.
     facts : mapping from label to str

@@ -1,4 +1,4 @@
-"""Command ``px4fuse explain``: prints the meaning, an example and the error rates of a finding."""
+"""Command ``px4fuse explain``: meaning, example, false alarms and detection of a finding."""
 
 import click
 

@@ -38,7 +38,10 @@ def _parse_numbers(text: str, syntax: str, max_absolute_value: float) -> list[fl
 
 
 def parse_landing(text: str) -> Landing:
-    """Parse a landing place: ``FORWARD,RIGHT`` (m) or ``FORWARD,RIGHT,DEG``."""
+    """Parse the landing place relative to the vehicle at take-off.
+
+    The text is ``FORWARD,RIGHT`` (m) or ``FORWARD,RIGHT,DEG``, with the clockwise rotation (°).
+    """
     return Landing(
         *_parse_numbers(
             text,

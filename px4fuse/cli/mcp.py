@@ -231,12 +231,12 @@ def _parse_arguments(
     folders: Sequence[Path],
     arguments: Mapping[str, Any],
 ) -> list[str]:
-    """Convert the arguments of a tool to a command line.
+    """Convert the arguments of an MCP tool call to those of a px4fuse command line.
 
     Raises
     ------
     LogError
-        A file is outside the folders.
+        A file is outside ``folders``, the folders that the MCP server may access.
     """
     command_words, operands = [command_name], ["--"]
     for name, parameter in parameters.items():

@@ -175,7 +175,10 @@ def _require_replaceable_file(path: Path, kind: str, can_replace: Callable[[byte
 def _is_same_report(
     new_results: Results, read: Callable[[bytes, str], Results], existing_content: bytes
 ) -> bool:
-    """Return True for a report on the same input files, with the same student or without one."""
+    """Return True if an existing report has the same input files and student as the new one.
+
+    An existing report without a student is also accepted.
+    """
     from px4fuse.results.contract import find_file_hashes, to_json
 
     existing_results = read(existing_content, "report")
@@ -266,7 +269,10 @@ def make_result_files(
 
 
 def write_outputs(contents: Mapping[Path, bytes]) -> None:
-    """Write all outputs of a command, and register them as written files.
+    """Write all outputs of a command.
+
+    The paths are stored in the click context, because error messages list the files that were
+    written before an error.
 
     Raises
     ------
@@ -338,7 +344,8 @@ def write_and_print_results(
     page : Page, optional
         Results to print.
     request : Request, optional
-        Settings that commands in ``page`` repeat.
+        Settings of this analysis. The commands that ``page`` recommends are printed with these
+        settings.
     written_files : iterable of Path
         Files that are already written.
     """

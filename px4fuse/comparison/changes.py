@@ -122,9 +122,11 @@ def find_main_axis_changes(
     axis: str,
     summary: FilterSummary,
 ) -> list[ChangedValues]:
-    """Return the changes of settings or data for re-runs along the axis of largest motion.
+    """Return the changes to test in re-runs of KF or EKF2 along the axis of largest motion.
 
-    The report shows their effect also if the filter is consistent.
+    A change consists of new values of KF settings or EKF2 parameters, or of corrected positions.
+    ``ekf2_inputs`` is None for KF. The report shows the effect of these changes also if the filter
+    is consistent.
     """
     # Changes that may correct the mean NIS are before those that may correct the mean NEES
     changes = remove_repeated_changes(
@@ -170,7 +172,11 @@ def classify_change(
 
 
 def find_default_settings(comparison: Comparison) -> ChangedValues:
-    """Return the change that sets SIGMA_A and SIGMA_Z to their default values."""
+    """Return the change of KF's noise settings to their default values.
+
+    The settings are SIGMA_A and SIGMA_Z; with GNSS positions, only SIGMA_A. Settings with default
+    values are omitted.
+    """
     user_settings, default_settings = comparison.settings, Settings()
     setting_names = (
         (SIGMA_A_KEY,) if comparison.source.origin.is_gnss else (SIGMA_A_KEY, SIGMA_Z_KEY)
@@ -190,7 +196,7 @@ def find_axis_tuning(tuning: TuningByAxis, axis: str) -> AxisTuning | None:
 def _find_offset_changes(
     estimates: Estimates, ekf2_inputs: ReplayInputs | None
 ) -> list[ChangedValues]:
-    """Return the change that corrects the time offset, if the time offset is significant."""
+    """Return the change that corrects a significant time offset of the source, if any."""
     time_offset = estimates.time_offset
     if (
         isinstance(time_offset, Unavailable)

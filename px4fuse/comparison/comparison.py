@@ -123,7 +123,11 @@ def make_run_tracks(run: KfRun) -> FilterTracks:
 def project_tracks(
     prepared_comparison: PreparedComparison, ekf2: Ekf2 | Unavailable, axis: Axis, segment: Segment
 ) -> tuple[FilterTracks, TableOrUnavailable]:
-    """Project EKF2 and ground truth onto an axis; innovations only in the analysed segment."""
+    """Project state, variance and innovations of EKF2, and ground truth, onto an axis.
+
+    State, variance and ground truth are from ``segment``. The innovations are always from the
+    analysed segment.
+    """
     ekf2_tracks = (
         FilterTracks(ekf2, ekf2, ekf2)
         if isinstance(ekf2, Unavailable)
@@ -210,7 +214,8 @@ def find_compared_track(
 ) -> tuple[TableOrUnavailable, TableOrUnavailable]:
     """Return the state and variance of a filter that are compared with ground truth.
 
-    EKF2: as logged. KF: predicted to EKF2's sample times, or to KF's steps if EKF2 is not logged.
+    EKF2: logged values. KF: values predicted to EKF2's sample times. If EKF2 is not logged, KF's
+    values at the ends of KF's prediction steps.
     """
     if tracks.run is None:
         return tracks.state, tracks.variance

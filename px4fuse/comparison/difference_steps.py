@@ -51,7 +51,8 @@ def explain_ekf2_difference(
 ) -> dict[str, DifferenceExplanation | Unavailable]:
     """Explain the difference between KF and EKF2 along each horizontal axis.
 
-    ``estimate_by_setting`` contains the corrected noises of KF.
+    ``estimate_by_setting`` contains the estimates that replace wrong noise settings of KF (SIGMA_A,
+    SIGMA_Z).
     """
     axis_results = {name: result for name, result in comparison.axes.items() if name != "down"}
     if not axis_results:
@@ -94,7 +95,10 @@ def explain_ekf2_difference(
 
 
 def find_corrected_noise_settings(comparison: Comparison, tuning: TuningByAxis) -> dict[str, float]:
-    """Return the estimates of those KF noises that are wrong by a large factor."""
+    """Return the estimates of SIGMA_A and SIGMA_Z that replace wrong settings of KF.
+
+    A setting from the user is wrong if it differs from its estimate by a large factor.
+    """
     axis_tuning = find_first_available_tuning(tuning, HORIZONTAL, AISLE_AXIS, "north", "east")
     if axis_tuning is None or comparison.source.origin.is_gnss:
         return {}

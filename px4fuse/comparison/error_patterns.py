@@ -1,7 +1,7 @@
-"""Patterns in the errors of a position source: jitter, noise that increases with speed, and others.
+"""Patterns in the errors of a position source, such as timestamp jitter.
 
-White noise is the deviation from a cubic polynomial through four neighbouring positions. Slow
-(time-correlated) errors are found only with ground truth.
+White noise is measured as the deviation of each position from a cubic polynomial through its four
+neighbours. Slowly varying (time-correlated) errors are found only with ground truth.
 """
 
 from typing import NamedTuple
@@ -169,9 +169,10 @@ class ErrorFit(NamedTuple):
     scale_error_sigma: float
 
     def compute_slow_error_mean_square_m2(self) -> float:
-        """Return the mean square (m²) of the residuals minus the variance of the white noise.
+        """Return the mean square (m²) of the time-correlated position errors.
 
-        The difference is the mean square of the slow (time-correlated) errors.
+        It is the mean square of the errors that remain after this fit, minus the variance of the
+        white noise.
         """
         return float(np.mean(self.residual_m**2, axis=0).sum()) - 2.0 * self.white_noise_sigma_m**2
 
@@ -428,7 +429,10 @@ def _fit_least_squares(columns: Array, values: Array) -> tuple[Array, Array]:
 
 
 def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
-    """Return a sinusoidal error that explains most of the slow errors, if any."""
+    """Return a sinusoidal position error that explains most of the time-correlated errors.
+
+    Return None if there is none. The errors are against ground truth.
+    """
     duration_s = fit.time_s[-1] - fit.time_s[0]
     max_frequency_hz = min(MAX_FREQUENCY_HZ, 0.25 / compute_median_interval_s(fit.time_s))
     frequency_step_hz = FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT / duration_s
@@ -470,7 +474,11 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
 
 
 def find_time_offset_variation(fit: ErrorFit) -> TimeOffsetVariation | None:
-    """Return the range of the time offset in flight if its variation explains the slow errors."""
+    """Return the range of the time offset in flight if it explains time-correlated errors.
+
+    The errors are those of the positions against ground truth, after the fit of constant
+    parameters.
+    """
     flight_part_indices = np.floor(
         (fit.time_s - fit.time_s[0]) / FLIGHT_PART_DURATION_FOR_OFFSET_S
     ).astype(int)

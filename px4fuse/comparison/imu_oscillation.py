@@ -1,4 +1,7 @@
-"""Oscillation of the accelerometer that the positions do not contain."""
+"""Oscillation of the measured acceleration that the measured positions do not show.
+
+Such an oscillation is not a motion of the vehicle.
+"""
 
 from typing import NamedTuple
 
@@ -31,14 +34,14 @@ MIN_AMPLITUDE_M_S2 = 0.3
 
 
 class ImuOscillation(NamedTuple):
-    """Frequency and amplitude of an oscillation along one axis of the vehicle."""
+    """Frequency and amplitude of an oscillating acceleration error along one vehicle axis."""
 
     frequency_hz: float
     amplitude_m_s2: float
 
 
 def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | None:
-    """Find an oscillation of the horizontal acceleration that the positions do not contain.
+    """Find an oscillation of the horizontal acceleration that the positions do not show.
 
     Second differences of the positions are compared with those of the doubly integrated
     acceleration, in axes that turn with the heading. Complex numbers are north + i east.

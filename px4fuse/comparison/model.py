@@ -122,7 +122,7 @@ class UntestedFilter(Unavailable, kw_only=True):
 
 
 class FilterDifference(Record, kw_only=True):
-    """Difference KF - EKF2 along one axis, at EKF2's sample times."""
+    """Difference KF - EKF2 of position and velocity along one axis, at EKF2's sample times."""
 
     count: Count
     position_rms_m: NonNegativeFloat

@@ -152,7 +152,10 @@ def _correct_convention(
 
 
 def select_source_innovations(flight: Flight, track: PositionTrack) -> Flight:
-    """Return a copy of the flight with EKF2's GNSS innovations if the position source is GNSS."""
+    """Replace EKF2's vision innovations by GNSS innovations if GNSS is the position source.
+
+    A flight with another position source is returned unchanged.
+    """
     if isinstance(flight.ekf2, Unavailable) or not track.origin.is_fused_as_gnss:
         return flight
     streams = dict(flight.streams)

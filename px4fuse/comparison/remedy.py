@@ -47,8 +47,9 @@ def estimate_gnss_delay_ms(
 
     - the estimated delay does not differ significantly from the logged delay,
     - vision is missing, or is not the position source of KF, so it was not checked,
-    - vision has wrong axes, a wrong unit or a wrong time offset, or
-    - GNSS has no velocity, or timestamps of the sender.
+    - vision has wrong axes, a wrong unit or a wrong time offset,
+    - GNSS has no velocity, or
+    - EKF2 ignores EKF2_GPS_DELAY, because the GNSS driver reports measurement times.
     """
     received_positions, vision = model.inputs.received_positions, model.inputs.vision_positions
     if (

@@ -126,7 +126,10 @@ def _compute_explained_fraction_error(rerun: Rerun, statistic: Statistic) -> flo
 
 
 def brings_inside_limits(rerun: Rerun, statistic: Statistic) -> bool:
-    """Return True if the change brings the mean NIS or mean NEES inside its limits."""
+    """Return True if the mean NIS or mean NEES is inside its limits after the change.
+
+    The limits are the 95 % band of the mean NIS, and 0 to MIN_REPORTED_NEES for the mean NEES.
+    """
     low, high = 0.0, MIN_REPORTED_NEES
     if statistic == "nis":
         low, high = compute_nis_band(rerun.after.innovations)
@@ -188,7 +191,10 @@ def find_cause_rerun(
 
 
 def find_partial_corrections(reruns: Iterable[Rerun], statistic: Statistic) -> list[Rerun]:
-    """Return the re-runs that correct a statistic only partly, best first."""
+    """Return the re-runs that bring the mean NIS or mean NEES only partly to 1, best first.
+
+    Return no re-run if one of them brings the mean inside its limits.
+    """
     candidates = [
         rerun
         for rerun in reruns
@@ -201,9 +207,9 @@ def find_partial_corrections(reruns: Iterable[Rerun], statistic: Statistic) -> l
 
 
 def compute_sigma_ratio_deviation(statistics: RunStatistics) -> float:
-    """Return the sum of |ln(actual σ / reported σ)| against source and ground truth.
+    """Return the sum of |ln(actual σ ÷ reported σ)| over source and ground truth.
 
-    The sum is 0 for a consistent filter.
+    The ratios are those of :func:`compute_sigma_ratios`. The sum is 0 for a consistent filter.
     """
     return sum(abs(math.log(ratio)) for ratio in compute_sigma_ratios(statistics).values())
 
@@ -223,7 +229,10 @@ def compute_preference_key(rerun: Rerun) -> tuple[bool, int, float]:
 
 
 def compute_sigma_ratios(statistics: RunStatistics) -> dict[Reference, float]:
-    """Return the ratios of actual to reported σ against position source and ground truth."""
+    """Return the ratios of actual to reported σ: √(mean NIS) and √(mean NEES).
+
+    The keys are "source" (from innovations) and "truth" (from errors against ground truth).
+    """
     squared_ratios: dict[Reference, float | None] = {
         "source": statistics.nis_mean,
         "truth": statistics.nees_mean,
@@ -242,7 +251,11 @@ def compare_sigma_ratios(rerun: Rerun) -> list[tuple[Reference, float, float]]:
 
 
 def becomes_consistent(rerun: Rerun, tested_reference: Reference | None = None) -> bool:
-    """Return True if a re-run makes an inconsistent filter consistent, against any reference."""
+    """Return True if a change makes an inconsistent filter consistent in its re-run.
+
+    Innovations ("source") or errors against ground truth ("truth") must show the improvement.
+    ``tested_reference`` selects one of them; by default, either is sufficient.
+    """
     return any(
         tested_reference in (None, reference)
         and classify_sigma_ratio(ratio_before, reference) != "consistent"
@@ -317,9 +330,10 @@ def has_effect(rerun: Rerun) -> bool:
 
 
 def can_show_improvement(rerun: Rerun) -> bool:
-    """Return True if an improvement would be visible in the statistics.
+    """Return True if the statistics of a re-run can show an improvement of the filter.
 
-    This requires ground truth, or a filter that is inconsistent before the change.
+    An improvement of the position RMSE requires ground truth. An improvement of the reported σ
+    requires a filter that is inconsistent before the change.
     """
     return rerun.before.position_rmse_m is not None or any(
         classify_sigma_ratio(ratio_before, reference) != "consistent"

@@ -1,10 +1,10 @@
-"""Search for the axes, unit, rotation and delay of positions that agree with the IMU.
+"""Search for axes, unit, rotation and delay of a position source, by comparison with the IMU.
 
 1. Grid search: compare each combination of axes, unit and time offset with the motion from the IMU.
 2. Least squares: refine the best combinations.
 
-Residuals (m) have a Student distribution. The log likelihood is relative to positions that do not
-depend on the motion.
+Residuals (m) have a Student distribution. The log likelihood of a combination is relative to the
+hypothesis that positions and IMU motion are independent.
 """
 
 from collections.abc import Mapping
@@ -113,7 +113,10 @@ class SignedAxisPermutation(NamedTuple):
         return (self.vertical_sign * self.handedness < 0) != (self.vertical_axis == 1)
 
     def combine_horizontal_axes(self, positions: Array) -> ComplexArray:
-        """Return first + i·second horizontal axis; times e^{i·heading}, it is north + i·east."""
+        """Return the horizontal positions as complex numbers: first axis + i · second axis.
+
+        The product with e^{i·heading} is north + i · east, with the heading of the first axis.
+        """
         return (
             positions[:, self.first_horizontal_axis]
             + 1j * self.handedness * positions[:, self.second_horizontal_axis]
@@ -148,7 +151,10 @@ SIGNED_AXIS_PERMUTATIONS = tuple(
 
 @dataclass(frozen=True)
 class SentPositions:
-    """Positions of a source as sent, and barometer heights (column ``down_m``)."""
+    """Positions in the axes, unit and clock of their source, and heights from the barometer.
+
+    The heights are in column ``down_m`` of ``barometer``.
+    """
 
     time_s: Array
     position_m: Array
@@ -208,7 +214,7 @@ class Hypothesis:
 
     @property
     def quarter_turns(self) -> int:
-        """Heading of the first horizontal axis, rounded to multiples of 90° (0: north, 1: east)."""
+        """Heading of the source's first horizontal axis, in units of 90° (0: north)."""
         return round(float(self.parameters[HEADING]) / (np.pi / 2.0))
 
     @property
@@ -218,7 +224,7 @@ class Hypothesis:
 
     @property
     def heading_minus_quarter_turns_rad(self) -> float:
-        """Heading (rad) of the first horizontal axis minus the nearest multiple of 90°."""
+        """Heading (rad) of the source's first horizontal axis minus quarter_turns · 90°."""
         return float(self.parameters[HEADING] - self.quarter_turns * np.pi / 2.0)
 
     def is_similar_to(self, other: "Hypothesis", max_difference_rad: float = np.pi / 4.0) -> bool:
@@ -343,24 +349,25 @@ def _compute_log_likelihoods(
     imu_squares_m2: Array,
     permutations: list[SignedAxisPermutation],
 ) -> ArrayPair:
-    """Compute the log likelihood of each combination with its best rotation, and this rotation.
+    """Compute the log likelihood of each combination of axes, unit and time offset.
 
-    The log likelihood is relative to positions that do not depend on the motion.
+    Each combination has the rotation about the vertical with the smallest residuals. The log
+    likelihood is relative to the hypothesis that positions and IMU motion are independent.
 
     Parameters
     ----------
     products : ndarray, shape (offsets, 3, 3)
-        Mean products of the source's axes and the axes north, east, down of the IMU.
+        Mean products of second differences: axes of the source times north, east, down of the IMU.
     source_squares : ndarray, shape (offsets, 3, 1)
-        Mean squares of the source's axes.
+        Mean squares of the second differences along the source's axes.
     imu_squares_m2 : ndarray, shape (offsets, 1, 3)
-        Mean squares of the IMU's axes.
+        Mean squares of the second differences from the IMU.
 
     Returns
     -------
     log_likelihood_per_residual : ndarray, shape (offsets, permutations, units)
     rotation_rad : ndarray, shape (offsets, permutations)
-        Heading of the first horizontal axis with the smallest residuals.
+        Heading of the source's first horizontal axis with the smallest residuals.
     """
     vertical_axis, vertical_sign, first_horizontal_axis, second_horizontal_axis, handedness = (
         np.transpose(permutations)
@@ -405,7 +412,11 @@ def refine_hypothesis(
     source_motion: SourceSecondDifferences,
     imu_motion: ImuSecondDifferences,
 ) -> Hypothesis:
-    """Refine delay, rotation and drifts of a hypothesis by robust least squares (Gauss-Newton)."""
+    """Refine the parameters of a hypothesis on the source's axes (robust Gauss-Newton).
+
+    The parameters are delay, heading, heading drift of the gyroscopes, clock drift and
+    accelerometer bias. The score of the returned hypothesis includes the log prior odds.
+    """
     rows = np.flatnonzero(source_motion.is_valid)
     rows = rows[:: max(1, len(rows) // MAX_REFINEMENT_ROWS)]
     best_hypothesis = replace(initial_hypothesis, score=-np.inf)
@@ -436,9 +447,11 @@ def _evaluate_hypothesis(
     source_motion: SourceSecondDifferences,
     imu_motion: ImuSecondDifferences,
 ) -> tuple[Hypothesis, Array] | None:
-    """Compute the score of a hypothesis, and the next Gauss-Newton step of its parameters.
+    """Compute the score of a hypothesis on the source's axes, and the next Gauss-Newton step.
 
-    Return None if source and IMU have too few common samples, or no motion.
+    The score is the log likelihood of the source's second differences, given those from the IMU.
+    The step is added to the parameters of the hypothesis. Return None if source and IMU have too few
+    common samples, or no motion.
     """
     delay_s, rotation_rad, heading_drift_rad_s, clock_drift, *accelerometer_bias_m_s2 = (
         hypothesis.parameters
@@ -592,7 +605,10 @@ def _fit_student_distributions(
 
 
 def _compute_total_log_odds(hypothesis: Hypothesis, positions: SentPositions) -> float:
-    """Return the log prior odds of a hypothesis plus the log likelihood ratio of the heights."""
+    """Return the log prior odds of a hypothesis, plus the evidence from heights.
+
+    The evidence is the log likelihood ratio of the source's heights, compared with the barometer.
+    """
     log_odds = hypothesis.axis_permutation.compute_log_prior_odds(hypothesis.quarter_turns)
     log_odds += UNIT_OTHER_THAN_METRES_LOG_PRIOR_ODDS * (hypothesis.unit != "m")
     log_odds += LARGE_TIME_OFFSET_LOG_PRIOR_ODDS * (abs(hypothesis.delay_s) > SMALL_TIME_OFFSET_S)

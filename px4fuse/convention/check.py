@@ -186,7 +186,10 @@ def _rank_convention_hypotheses(
 def _replace_delay_by_low_pass_filter(
     hypothesis: Hypothesis, positions: SentPositions, imu_motion: ImuSecondDifferences
 ) -> Hypothesis:
-    """Replace the delay of a hypothesis by a low-pass filter, if the filter fits better."""
+    """Replace the delay in a hypothesis by a low-pass filter of the source, if it fits better.
+
+    Both hypotheses are compared by the likelihood of the positions, given the motion from the IMU.
+    """
     if not MIN_LOW_PASS_DELAY_S < hypothesis.delay_s < MAX_LOW_PASS_DELAY_S:
         return hypothesis
     filtered_motion = filter_imu_motion(imu_motion, hypothesis.delay_s)
@@ -205,7 +208,7 @@ def _replace_delay_by_low_pass_filter(
 
 
 def is_source_fused(flight: Flight) -> bool:
-    """Return True if the fusion flags show that EKF2 fused the positions or the yaw."""
+    """Return True if the log shows that EKF2 fused position, height or yaw of the source."""
     fusion_flags = flight.ekf2.fusion_flags if isinstance(flight.ekf2, Ekf2) else None
     return isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags > 0).any(axis=None))
 
@@ -253,7 +256,10 @@ def _choose_convention(
     positions: SentPositions,
     clock_drift: float,
 ) -> Convention:
-    """Return the best hypothesis, with its verdict and the likely ones of the others."""
+    """Return the best hypothesis as convention of the source, with verdict and alternatives.
+
+    The alternatives are the other hypotheses that are also likely.
+    """
     # Without heights, z up and z down fit equally well
     has_heights = positions.position_m[:, 2].any()
     other_hypotheses = [
@@ -295,9 +301,10 @@ def _choose_convention(
 def _judge_hypothesis(
     hypothesis: Hypothesis, positions: SentPositions, is_ambiguous: bool
 ) -> ConventionVerdict:
-    """Return the first verdict that applies: not determinable, doubtful, ambiguous, determined.
+    """Return the verdict on the best hypothesis on the axes, unit and delay of a source.
 
-    ``is_ambiguous`` is True if other conventions fit nearly as well.
+    The first of these verdicts that applies is returned: not determinable, doubtful, ambiguous,
+    determined. ``is_ambiguous`` is True if other conventions fit nearly as well.
     """
     if hypothesis.score < MIN_LOG_LIKELIHOOD_GAIN:
         return "not determinable"
@@ -326,7 +333,10 @@ def _describe_hypothesis(hypothesis: Hypothesis) -> str:
 
 
 def compute_residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
-    """Return σ of the horizontal residuals divided by σ of the noise of source and IMU."""
+    """Return σ of the residuals of a hypothesis divided by σ of the expected noise.
+
+    Both are of horizontal second differences. The expected noise is that of source and IMU.
+    """
     # Third differences of positions hardly contain motion: estimate the noise from third
     # differences, and convert its σ to second differences
     third_differences = np.diff(positions.position_m, 3, axis=0)
@@ -346,7 +356,8 @@ def _estimate_clock_drift(
 ) -> float:
     """Return the rate error (s/s) of the source's clock, or 0 if it is not significant.
 
-    A large drift hides the motion: if no hypothesis fits, the best tested drift is removed first.
+    A large drift hides the motion. If the best hypothesis on the axes fits badly, the search is
+    therefore repeated with several drifts.
     """
     # If no hypothesis fits, test a grid of drifts. It is searched for candidates only, because a
     # refinement of each would take too long

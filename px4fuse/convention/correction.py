@@ -143,7 +143,11 @@ def find_convention_faults(
 
 
 def _find_axis_fault_and_rotation(convention: Convention) -> tuple[bool, float]:
-    """Return True if the axes are not NED, and the clockwise rotation (°) of the positions."""
+    """Return True if the axes are not NED, and the clockwise rotation (°) of the positions.
+
+    The axes are wrong if no rotation about the vertical makes them NED. The rotation is the one
+    that remains after a conversion of wrong axes to NED; it is 0 if it is small.
+    """
     # Wrong axes: the sent frame is the nearest one of right angles, so the fault is this frame and
     # the small rotation that is left
     rotation_deg, is_z_up = convention.rotation_deg, convention.z == "up"
@@ -183,7 +187,8 @@ def convert_to_px4_convention(
 ) -> tuple[Flight, PositionTrack]:
     """Convert a position source to PX4's axes (NED), unit (m) and boot clock.
 
-    If EKF2 fused the wrong positions, its attitude is also replaced.
+    If EKF2 fused the positions in the wrong convention, EKF2's attitude is also wrong. It is then
+    replaced by the attitude from the gyroscopes.
     """
     samples, orientation, origin = track.samples, track.orientation, track.origin
     matrix_to_ned = _make_matrix_to_ned_metres(convention, faults)
@@ -210,11 +215,11 @@ def convert_to_px4_convention(
 
 
 def _replace_attitude(flight: Flight, convention: Convention, faults: ConventionFaults) -> Flight:
-    """Replace EKF2's attitude by the attitude from the gyroscopes, if EKF2 fused wrong positions.
+    """Replace EKF2's attitude by that from the gyroscopes, if EKF2 fused wrong positions.
 
-    The heading of the new attitude must fit the frame of the positions. If
-    :func:`convert_to_px4_convention` does not correct their axes, their x axis is used as north:
-    the attitude is then rotated by the detected angle from the x axis to north.
+    The heading of the new attitude must fit the frame of the positions. If neither axes nor
+    rotation of the positions were corrected, their x axis is used as north. The attitude is then
+    rotated by the detected angle from the x axis to north.
     """
     inertial_data = integrate_inertial_data(flight) if faults.affects_ekf2 else None
     if inertial_data is None:

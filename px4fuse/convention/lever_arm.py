@@ -66,8 +66,10 @@ def find_imu_position_m(flight: Flight) -> list[float]:
 def estimate_lever_arm(flight: Flight, track: PositionTrack) -> LeverArm | None:
     """Estimate the error of the lever arm in EKF2's parameters (true minus parameter).
 
-    The positions are corrected by the sensor's parameters. The estimate from the IMU also contains
-    an error of EKF2_IMU_POS, with the opposite sign. Return None if the error is not significant.
+    The lever arm in the parameters was already subtracted from the positions of ``track``. The
+    reference is ground truth. If ground truth gives no significant error, the IMU is the reference,
+    but not for GNSS. The estimate from the IMU also contains an error of EKF2_IMU_POS, with the
+    opposite sign. Return None if the error is not significant.
     """
     lever_arm = None
     if isinstance(flight.truth, Truth):
@@ -142,7 +144,11 @@ def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) 
 
 
 def _make_lever_arm(parameters: Array, covariance: Array, rotation_deg: float) -> LeverArm:
-    """Return the lever arm from the first two parameters; the last one is the rotation (rad)."""
+    """Make a lever arm from the fitted parameters and their covariance.
+
+    The first two parameters are the lever arm forward and right (m). The last row of ``covariance``
+    is that of the rotation (rad).
+    """
     forward_m, right_m = parameters[:2].tolist()
     return LeverArm(
         forward_m,

@@ -89,7 +89,10 @@ class InertialData:
 
 @dataclass(frozen=True)
 class SourceSecondDifferences:
-    """Second differences of the positions as sent, at a constant interval."""
+    """Second differences of a source's positions, in the axes and unit of the source.
+
+    Their interval is constant.
+    """
 
     time_s: Array
     second_differences: Array
@@ -295,7 +298,10 @@ def integrate_imu_motion(inertial_data: InertialData, attitude: Array) -> ImuSec
 def filter_imu_motion(
     imu_motion: ImuSecondDifferences, time_constant_s: float
 ) -> ImuSecondDifferences:
-    """Apply a first-order low-pass filter to second differences from the IMU."""
+    """Apply a first-order low-pass filter to the second differences from the IMU.
+
+    These are the second differences of position that are integrated from the acceleration.
+    """
     previous_output_weight = np.exp(-GRID_INTERVAL_S / time_constant_s)
     table = imu_motion.table.copy()
     for row in range(1, len(table)):

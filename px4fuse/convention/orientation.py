@@ -73,9 +73,9 @@ class OrientationCandidate(NamedTuple):
 
     @property
     def order_and_frames_up_to_heading(self) -> tuple[str, str]:
-        """Quaternion order, body frame and world frame; ENU counts as NWU.
+        """Quaternion order and frames, equal for conventions that differ only in heading.
 
-        ENU and NWU differ only in heading.
+        The world frames ENU and NWU differ only in heading, so ENU is replaced by NWU.
         """
         return self.convention.order, self.convention.frames.replace("ENU", "NWU")
 

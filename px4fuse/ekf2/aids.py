@@ -145,7 +145,7 @@ class AidResult(Record, kw_only=True):
 
     @property
     def nis_mean(self) -> float:
-        """Mean NIS over all axes; NaN with too few samples."""
+        """Mean NIS of EKF2 with this aiding source, over all its axes; NaN if unknown."""
         return _compute_mean_nis(self.axes)
 
 
@@ -327,7 +327,10 @@ def _find_largest_innovation_mean_change(
 
 
 def _find_applied_gate(aid: Aid, aid_log: AidLog) -> float:
-    """Return the gate (√S) of EKF2, from logged test ratios or from the gate parameter."""
+    """Return the innovation gate of EKF2, in multiples of √S.
+
+    It is computed from logged test ratios or, without them, from the gate parameter.
+    """
     axis = aid_log.axes[0]
     if f"ratio_{axis}" in aid_log.samples:
         rows = aid_log.samples[aid_log.samples[f"ratio_{axis}"] > 0.0]

@@ -54,7 +54,9 @@ class BiasEstimator:
         is_bias_updated: BoolArray,
         represented_sample_count: Array | float = 1.0,
     ) -> ArrayPair:
-        """Correct a measurement for the bias, and update the bias; return innovation and R.
+        """Correct an innovation for the sensor bias, and update the bias with this innovation.
+
+        Return the corrected innovation, and R plus the variance of the bias.
 
         Parameters
         ----------
@@ -63,7 +65,7 @@ class BiasEstimator:
         interval_s : ndarray
             Time since the previous sample; 0 if the bias is not updated.
         represented_sample_count : float or ndarray, shape (filters,)
-            Number of EKF2 samples that this sample represents.
+            Number of EKF2 samples of which this logged sample is the mean.
         """
         # 1. Prediction: the variance grows by the random walk since the previous sample
         is_bias_wrong = np.abs(self.mean_signed_test_ratio) > MAX_MEAN_TEST_RATIO_OF_VALID_BIAS

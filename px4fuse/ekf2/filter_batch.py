@@ -1,4 +1,4 @@
-"""Configurations of the EKF2 model, and several of them in arrays for one computation."""
+"""Filter configurations of the EKF2 replay, and batches of them that are replayed at once."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -62,7 +62,8 @@ class FilterConfiguration:
     def can_use_logged_bad_acceleration_flag(self, inputs: ReplayInputs) -> bool:
         """Return True if EKF2's logged bad-acceleration flag is valid for this configuration.
 
-        The flag depends on the height parameters.
+        EKF2 computes the flag from vertical innovations. It is valid if the configuration uses the
+        logged decisions, or changes nothing that has an effect on vertical innovations.
         """
         has_logged_height_parameters = not self.disable_time_s_by_aid and all(
             value == inputs.settings[name]
@@ -96,7 +97,7 @@ class FilterConfiguration:
 
 
 class FilterBatch:
-    """Filter configurations that are computed at once in one part of a flight, with their events.
+    """Filter configurations that are replayed at once in one part of a flight.
 
     Attributes
     ----------
@@ -104,9 +105,9 @@ class FilterBatch:
     estimates_biases, has_gate, and so on : ndarray of bool, shape (filters,)
         Fields of :class:`FilterConfiguration`.
     events : ndarray, shape (events, filters)
-        Fusions of each filter, see :data:`~px4fuse.ekf2.intervals.EVENT_DTYPE`.
+        Fusion events of each configuration, see :data:`~px4fuse.ekf2.intervals.EVENT_DTYPE`.
     event_steps, event_time_s : ndarray, shape (events, filters)
-        Prediction step of each fusion, and its time.
+        Prediction step of each fusion event, and its time.
     is_enabled_by_aid : dict from PX4's name to ndarray of bool, shape (events, filters)
         True before the aiding source is disabled.
     """

@@ -1,7 +1,8 @@
 """Main loop of the EKF2 model: prediction and fusion in one part of a flight.
 
-Several filter configurations are computed at once. Each event fuses a position. In a gap of the
-position source, an event fuses only height and heading.
+Several filter configurations are computed at once; in shapes, "filters" is their number. Each
+fusion event fuses a position. In a gap of the position source, an event fuses only height and
+heading.
 
 Symbols: x, P: state and covariance; ν: innovation; R: measurement noise; S: innovation variance.
 
@@ -247,7 +248,11 @@ def run_segment(  # noqa: PLR0912 (the order of EKF2's fusions in one place)
 
 
 class _Prediction:
-    """Prediction from one event to the next: x = Φx + u, P = ΦPΦ' + Q."""
+    """Prediction of state and covariance from one fusion event to the next.
+
+    x = Φx + u and P = ΦPΦ' + Q. The vector u is the state change by acceleration and attitude
+    correction.
+    """
 
     def __init__(self, batch: FilterBatch, bad_acceleration_flag: BadAccelerationFlag) -> None:
         self.batch, self.bad_acceleration_flag = batch, bad_acceleration_flag
@@ -270,7 +275,7 @@ class _Prediction:
         self.bias_noise_per_step, self.max_variance_with_noise = _compute_bias_noise(batch)
 
     def _prepare_transitions(self, events: slice) -> None:
-        """Compute Φ, u and Q of several events at once."""
+        """Compute Φ, u and Q of the predictions to several fusion events at once."""
         batch = self.batch
         transitions = {one: one.compute_transitions(events) for one in set(batch.intervals)}
         (
@@ -293,7 +298,10 @@ class _Prediction:
         )
 
     def predict(self, event: int, x: Array, P: Array) -> None:
-        """Predict x and P at an event in place; call this method in order of events."""
+        """Predict x and P from the previous fusion event to this one, in place.
+
+        Call this method in the order of the events.
+        """
         batch, flag = self.batch, self.bad_acceleration_flag
         self.bias_at_previous_event = x[:, ACCELEROMETER_BIAS].copy()
         self.bias_covariance_at_previous_event = P[:, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS].copy()
@@ -405,7 +413,10 @@ class _PositionFusion:
         self.reset_m = np.zeros((*events.shape, 2))
 
     def test_and_fuse_gnss(self, event: int, x: Array, P: Array) -> ArrayPair:
-        """Test the sample of an event with the gate, and fuse it if it is from GNSS."""
+        """Test the sample of a fusion event with the gate, and fuse it if it is from GNSS.
+
+        A sample consists of position and, from GNSS, velocity.
+        """
         batch, R = self.batch, self.measurement_variance[event]
         # 1. Innovation and gate of each component
         nu = self.measured_values[event] - x[:, VELOCITY_AND_POSITION]
@@ -492,7 +503,10 @@ class _PositionFusion:
         return x, P
 
     def reset_states(self, event: int, x: Array, P: Array) -> None:
-        """Set the states of filters with a reset to the measurement, in place."""
+        """Set the states to the measurement, in place.
+
+        Only filter configurations that reset their states in this fusion event are changed.
+        """
         rules, is_reset = self.batch.inputs.rules, self.reset[event]
         resets = [(HORIZONTAL_POSITION, HORIZONTAL_POSITION_COLUMNS, rules.reset_variance_factor)]
         if self.has_velocity and rules.resets_velocity:
@@ -505,7 +519,10 @@ class _PositionFusion:
         )
 
     def get_velocity_down_update(self, event: int) -> Array:
-        """Return ν and S of the vertical velocity, shape (2, filters); NaN if it is not fused."""
+        """Return ν and S of the vertical GNSS velocity in a fusion event; NaN if not fused.
+
+        The shape is (2, filters), with one column for each filter configuration.
+        """
         update = [
             values[event, :, VELOCITY_DOWN_COLUMN]
             for values in (self.innovation, self.innovation_variance)
@@ -514,9 +531,10 @@ class _PositionFusion:
 
 
 def _average_samples(batch: FilterBatch, aid: Aid, samples: SensorSamples) -> EventSamples:
-    """Return the mean magnetometer or optical flow samples, shape (events, filters).
+    """Return the mean magnetometer or optical flow samples of each fusion event.
 
-    The events of each filter are a column of ``batch.event_steps``.
+    The shape is (events, filters). The events of each filter configuration are a column of
+    ``batch.event_steps``.
     """
     mean_samples = EventSamples(
         *_stack_by_filter(
@@ -546,7 +564,7 @@ def _make_bad_acceleration_flag(batch: FilterBatch) -> BadAccelerationFlag:
 
 
 def _stack_by_filter(tuples_by_filter: Sequence[tuple[Array, ...]]) -> list[Array]:
-    """Stack the arrays of all filters along axis 1."""
+    """Stack the arrays of all filter configurations along axis 1; axis 0: fusion events."""
     return [np.stack(arrays, axis=1) for arrays in zip(*tuples_by_filter, strict=True)]
 
 
@@ -590,19 +608,21 @@ def _update_sequentially(
 class _FusionDecisions:
     """Decisions on each position sample: reject it, fuse it, or reset the position to it.
 
-    EKF2 resets the position after a time without fusion. After several resets, EKF2 stops fusion.
+    Several filter configurations are computed at once. Each fusion event has at most one position
+    sample. EKF2 resets the position after a time without fusion. After several resets, EKF2 stops
+    fusion.
 
     Source: updateEvPosFusion, startEvPosFusion (``ev_pos_control.cpp``).
 
     Parameters
     ----------
     action : ndarray of int, shape (events, filters)
-        Action of each filter on the sample if it is inside the gate.
+        Action of each filter configuration on the sample if it is inside the gate.
 
     Attributes
     ----------
     logged_rejected_flags, logged_resets : ndarray, shape (events,)
-        EKF2's logged decisions; NaN for an unknown rejection.
+        Rejections and resets in the log; NaN for an unknown rejection.
     last_position_s, last_velocity_s : ndarray, shape (filters,)
         Time of the last fusion or reset.
     """
@@ -628,9 +648,10 @@ class _FusionDecisions:
     def decide_fusion(
         self, event: int, is_outside_gate: BoolArray, is_velocity_fused: BoolArray
     ) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
-        """Decide for each filter if a position sample is rejected, fused, or used for a reset.
+        """Decide if the position sample of an event is rejected, fused, or used for a reset.
 
-        Return four masks: position rejected, position fused, position reset, velocity fused.
+        Return four masks, with one value for each filter configuration: position rejected, position
+        fused, position reset, velocity fused.
         """
         now_s, action = self.time_s[event], self.sample_actions[event]
         is_reset_logged = self.logged_resets[event]
@@ -677,10 +698,11 @@ class _FusionDecisions:
         return is_rejected, is_fused, is_reset, is_velocity_fused & ~is_reset
 
     def _find_rejected(self, event: int, is_outside_gate: BoolArray) -> BoolArray:
-        """Return True for filters that reject the sample.
+        """Return True for each filter configuration that rejects the sample of a fusion event.
 
-        Filters that use logged decisions reject a sample if EKF2 rejected it. If this is neither
-        logged nor follows from the logged resets, they use the gate as the other filters.
+        Configurations that use logged decisions reject the sample if EKF2 rejected it in the log.
+        If the decision is neither logged nor follows from the logged resets, they use the gate as
+        the other configurations.
         """
         logged_flag = self.logged_rejected_flags[event]
         if not math.isnan(logged_flag):
@@ -699,7 +721,10 @@ class _FusionDecisions:
         return np.asarray(is_outside_gate & ~(self.uses_logged_decisions & was_fused_in_log))
 
     def _is_timed_out(self, now_s: Array) -> BoolArray:
-        """Return True for filters that reset the position at the next rejection."""
+        """Return True for each filter configuration whose last fusion is too long ago.
+
+        Such a configuration resets the position at the next rejection.
+        """
         fusion_rules = self.fusion_rules
         # Releases that reset velocity and position together wait longer while velocity is fused
         is_velocity_fused = now_s - self.last_velocity_s <= fusion_rules.reset_timeout_s
@@ -832,7 +857,11 @@ def _limit_bias_variance(P: Array, lower_limit_m2_s4: float, estimates_biases: B
 
 
 def _collect_measurements(batch: FilterBatch) -> ArrayPair:
-    """Return measurements and variances, shape (events, filters, 6): velocity, position (NED)."""
+    """Return the measurements of the position source in each fusion event, with variances.
+
+    The shape is (events, filters, 6), with one column for each filter configuration. The last axis
+    is velocity (m/s), then position (m), both in NED.
+    """
     inputs, segment, parameters = batch.inputs, batch.segment, batch.parameters
     received_positions, aid, event_steps = inputs.received_positions, inputs.aid, batch.event_steps
     samples = np.maximum(batch.events["sample"], 0)

@@ -136,9 +136,9 @@ class UnfusedPositions:
         return samples.loc[self.unfused_span_s[0] - lead_time_s : self.unfused_span_s[1]]
 
     def compute_status_bit_fraction(self, field_name: str, bit: int = 0) -> float:
-        """Return the fraction of the time without fusion in which a status bit is set.
+        """Return the fraction of the time without fusion in which an EKF2 status bit is set.
 
-        Return NaN if the status field is not logged.
+        The time without fusion is ``unfused_span_s``. Return NaN if the status field is not logged.
         """
         state_changes = self.ekf2.status_flags.get(field_name)
         if state_changes is None:

@@ -97,24 +97,28 @@ class BadAccelerationFlag:
             ].T
 
     def compute_bad_acceleration_fraction(self, begin_s: Array, end_s: Array) -> Array:
-        """Return the fraction of a time interval with a set flag, for each configuration."""
+        """Return the fraction of a time interval in which the flag is set.
+
+        The result has one value for each filter configuration.
+        """
         if not (self.until_s > begin_s).any():
             return np.zeros_like(self.until_s)
         overlap_s = np.minimum(self.until_s, end_s) - np.maximum(self.since_s, begin_s)
         return np.asarray(np.maximum(overlap_s, 0.0) / np.maximum(end_s - begin_s, 1e-9))
 
     def update(self, time_s: Array, previous_innovations: Array, innovations: Array) -> None:
-        """Update the flag for a bad vertical acceleration after a fusion of heights.
+        """Update the flag for a bad vertical acceleration after a fusion event.
 
         Configurations that use the logged flag are not changed.
 
         Parameters
         ----------
         time_s : ndarray, shape (filters,) or (1,)
-            Time of the fusion.
+            Time of the fusion event.
         previous_innovations, innovations : ndarray, shape (k + 1, filters)
-            Height innovations ÷ √S (positive upwards) of the previous and of this event: k of the
-            barometer, then one of GNSS. NaN without a sample.
+            Height innovations ÷ √S (positive upwards) of the previous and of this event. The first
+            k rows are those of k barometer samples, the last row is that of GNSS. NaN without a
+            sample.
         """
         *previous_barometer, previous_gnss = previous_innovations
         *barometer, gnss = innovations
@@ -150,21 +154,23 @@ def _has_large_height_innovations(barometer_innovation: Array, gnss_innovation: 
 
 
 class HeightFilter:
-    """Fusion of heights as in EKF2, for several filter configurations at once.
+    """Fusion of barometer and GNSS heights as in EKF2, for several filter configurations.
 
-    Each event fuses the samples since the previous event. The arrays of samples have the shape
-    (k + 1, events, filters): up to k barometer samples of each event, then its GNSS sample.
+    Each fusion event fuses the samples since the previous event: up to k barometer samples, then
+    one GNSS sample. Arrays of samples have the shape (k + 1, events, filters).
 
     Parameters
     ----------
     has_gnss_fix, gnss_down_m : ndarray, shape (events, filters)
-        True for a GNSS fix, and its height (positive down).
+        True if a GNSS height is available in the event, and this height (positive down).
 
     Attributes
     ----------
-    down_m, age_s, time_s, dead_zone_m, weight, has_sample : ndarray
-        Height of each sample, age at its event, measurement time, dead zone, number of EKF2 samples
-        that it represents, and True for a sample (False for padding).
+    down_m, age_s, time_s : ndarray
+        Height (m, down) of each sample, age at its fusion event, and measurement time.
+    dead_zone_m, weight, has_sample : ndarray
+        Width of the dead zone for positive innovations (ground effect), number of EKF2 samples of
+        which the logged sample is the mean, and True for a sample (False for padding).
     last_sample_s : ndarray, shape (filters,)
         Time (s) of the last sample of the sensor whose bias EKF2 estimates.
     update_records : ndarray, shape (events, k + 2, 4, filters)
@@ -234,9 +240,9 @@ class HeightFilter:
     def make_update_table(
         self, sensor: str, configuration_index: int, end_s: Array
     ) -> pd.DataFrame:
-        """Return a table of one configuration's updates with a height sensor.
+        """Return a table of the updates of one filter configuration with a height sensor.
 
-        ``end_s`` contains the time (s) of each event.
+        ``end_s`` contains the time (s) of each fusion event.
         """
         # The barometer samples are before the GNSS sample
         samples = slice(self.gnss_index)
@@ -260,9 +266,10 @@ class HeightFilter:
     def update_bad_acceleration_flag(
         self, event: int, time_s: Array, velocity_down_update: Array
     ) -> None:
-        """Update the flag after the fusion of an event at ``time_s``.
+        """Update the bad-acceleration flag with the vertical innovations of a fusion event.
 
-        ``velocity_down_update``, shape (2, filters), contains ν and S of the GNSS velocity.
+        ``time_s`` is the time of the event. ``velocity_down_update``, shape (2, filters), contains
+        ν and S of the GNSS velocity.
         """
         self.update_records[event, -1, :2] = velocity_down_update
         # Previous and this event; for the first event, twice this event
@@ -278,7 +285,7 @@ class HeightFilter:
     def _fuse_sample(
         self, aid: Aid, event: int, sample_index: int, x: Array, P: Array, R: Array
     ) -> ArrayPair:
-        """Fuse a height (m, down) that was measured before the event."""
+        """Fuse a height (m, down) measured before its fusion event; return x and P."""
         if not self.has_samples[sample_index][event]:
             return x, P
         sample = sample_index, event

@@ -184,8 +184,10 @@ class ReplayInputs:
     ----------
     settings : dict
         Logged EKF2 parameters, by PX4 name.
+    aid : Aid
+        Aiding source of the horizontal position: external vision or GNSS.
     received_positions : ReceivedPositions
-        Samples of the horizontal position source ``aid``.
+        Position samples of ``aid``.
     mean_step_s, configured_step_s : float
         Length of a prediction step: mean in the log, and EKF2_PREDICT_US.
     horizon_s : float

@@ -303,12 +303,17 @@ def _compute_imu_process_noise(
 ) -> ArrayPair:
     """Return the process noise for unit gyro noise, and for unit accelerometer noise.
 
-    The specific force is assumed to be constant in an interval of n steps of length d. In one step,
-    an attitude error changes the velocity by m per rad. Noise that acts k steps before the end of
-    the interval changes the attitude by d, the velocity by k m d (gyro) or d (accelerometer), and
-    the position by k (k - 1) m d² / 2 or k d². The blocks are sums of products of these changes
-    over k = 0 to n - 1. Two sums of gyro noise are replaced by their leading terms, which dominate
-    for large n: Σ k² (k - 1) / 2 by n⁴ / 8, and Σ k² (k - 1)² / 4 by n⁵ / 20.
+    An interval between two fusions has n prediction steps of length d. The specific force is
+    assumed to be constant, so an attitude error of 1 rad changes the velocity by m in each step. A
+    noise value of 1 in a step that is followed by k steps changes the state at the end of the
+    interval:
+
+    - gyro: attitude by d, velocity by k m d, position by k (k - 1) m d² / 2
+    - accelerometer: velocity by d, position by k d²
+
+    The process noise is the sum of the products of these changes over k = 0 to n - 1. Two
+    sums of gyro noise are replaced by their leading terms, which dominate for large n:
+    Σ k² (k - 1) / 2 by n⁴ / 8, and Σ k² (k - 1)² / 4 by n⁵ / 20.
     """
     n = np.maximum(prediction_step_counts, 1.0)[:, None, None]
     d = duration_s[:, None, None] / n

@@ -282,7 +282,7 @@ def _exclude_samples(model: Ekf2Model, excluded_times_s: Array) -> Ekf2Model:
 
 
 def _replace_inputs(model: Ekf2Model, **changes: Any) -> Ekf2Model:
-    """Return a model with other inputs, without the replays with the previous inputs."""
+    """Return a model with other inputs, without the stored replays of the previous inputs."""
     return replace(model, inputs=replace(model.inputs, **changes), runs=())
 
 

@@ -110,8 +110,9 @@ class SensorSamples:
     step_indices : ndarray of int, shape (m,)
         Prediction step that fuses each mean.
     value : ndarray, shape (m, k)
-        Magnetic field (gauss, FRD), or velocity forward and right (m/s) from optical flow, minus
-        the velocity change since the start of the segment from the IMU.
+        Magnetometer: magnetic field (gauss, FRD). Optical flow: velocity forward and right (m/s).
+        The velocity change from the IMU since the start of the segment is subtracted from it, so
+        that samples of several times can be averaged.
     ned_to_body_rotation : ndarray, shape (m, k, 3)
         Mean rotation from NED to the body axes.
     sample_count : ndarray, shape (m,)
@@ -305,7 +306,7 @@ def group_samples_by_event(
 def make_update_table(
     update_records: Array, measurement_times_s: Array, end_s: Array, axes: Sequence[NedAxis]
 ) -> pd.DataFrame:
-    """Return the updates with one aiding source as a table, indexed by measurement time (s).
+    """Return a table of the updates with one aiding source, indexed by measurement time (s).
 
     Parameters
     ----------
@@ -315,8 +316,9 @@ def make_update_table(
         variances. The last of them may be missing: GNSS velocity ends with rejected, heights with
         fused, vision in addition to GNSS with reset.
     measurement_times_s : ndarray, shape (events, k)
+        Measurement time of each sample.
     end_s : ndarray, shape (events,)
-        Time of each event.
+        Time of each fusion event.
     axes : sequence of str
     """
     has_innovation = np.isfinite(update_records[..., 0])
@@ -339,10 +341,10 @@ def make_update_table(
 
 
 def stack_samples(samples_by_filter: Sequence[Array]) -> Array:
-    """Stack the samples of all filters along a new last axis.
+    """Stack the sensor samples of all filter configurations along a new last axis.
 
-    The second axis of each array contains the samples of one event. Shorter arrays are padded with
-    zeros to the largest number of samples.
+    The axes of each array are quantities, samples of one fusion event, and events. Arrays with
+    fewer samples per event are padded with zeros.
     """
     max_samples_per_event = max(samples.shape[1] for samples in samples_by_filter)
     return np.stack(
@@ -460,7 +462,7 @@ def _find_data_boundary_times_s(imu_times_s: Array, position_times_s: Array) -> 
 def _add_gnss_model_inputs(
     segment: ReplaySegment, imu: pd.DataFrame, ekf2: Ekf2, fusion_record: FusionRecord
 ) -> ReplaySegment:
-    """Add the inputs that only the GNSS model uses, such as earth rotation and clipping."""
+    """Add the inputs that only a replay of GNSS uses, such as earth rotation and clipping."""
     internal_to_published_position_ratio = compute_internal_to_published_position_ratio(
         fusion_record
     )
@@ -591,10 +593,10 @@ def _make_segment(
     def compute_rotation_from_end_attitude(
         attitude_samples: pd.DataFrame, lead_time_s: float, end_attitude: Array
     ) -> ArrayPair:
-        """Return the times (s) of the samples, and their rotation relative to ``end_attitude``.
+        """Return the times (s) of attitude samples, and their rotation from ``end_attitude``.
 
-        ``end_attitude`` is the attitude at the end of each step. Samples up to ``lead_time_s``
-        before the start are included.
+        ``end_attitude`` is the attitude at the start of the segment and at the end of each
+        prediction step. Samples up to ``lead_time_s`` before the start of the segment are included.
         """
         attitude_samples = rows_between(
             attitude_samples, step_times_s[0] - lead_time_s, step_times_s[-1]
@@ -681,8 +683,9 @@ def _add_magnetic_field(
 ) -> ReplaySegment:
     """Add magnetic field states and magnetometer samples to a segment.
 
-    If the log contains EKF2's low-pass filtered innovations, the samples that EKF2 fused between
-    two rows are computed from them. Otherwise, the samples in the log represent all samples.
+    The log contains only some of the samples that EKF2 fused. If EKF2's low-pass filtered
+    innovations are logged, they give the mean of the samples between two logged ones. Otherwise,
+    each logged sample is used as the mean of several samples.
     """
     initial_row = fusion_record.delayed_state.iloc[start_row]
     field_gauss = fusion_record.magnetic_field_gauss
@@ -810,16 +813,16 @@ def compute_low_pass_weights(
     interval_s: Array,
     new_sample_weight: Array | float,
 ) -> tuple[IntArray, Array]:
-    """Return prediction step and weight of each sample in m weighted means of sensor samples.
+    """Return the samples in each of m low-pass filtered values, and their weights.
 
-    The weights are those of a first-order low-pass filter, and their sum is 1 in each mean. Both
-    arrays have the shape (m, k) for up to k samples per mean, newest sample first. The weight is 0
-    after the last sample of a mean.
+    Each sample is given by its prediction step. Both arrays have the shape (m, k) for up to k
+    samples per value, newest sample first. The weights are those of a first-order low-pass filter,
+    and their sum is 1 in each value. The weight is 0 after the last sample of a value.
 
     Parameters
     ----------
     newest_sample_times_s, sample_count, interval_s : ndarray, shape (m,)
-        For each mean: time of its newest sample, number of samples, and sample interval.
+        For each value: time of its newest sample, number of samples, and sample interval.
     new_sample_weight : float or ndarray, shape (m,)
         Weight of the newest sample in one update of the low-pass filter.
     """

@@ -163,7 +163,7 @@ class DifferenceExplanation(Record, kw_only=True):
 
     @property
     def unexplained_fraction(self) -> float:
-        """Unexplained fraction of the mean square position difference KF - EKF2."""
+        """Fraction of the mean square position difference that no replacement explains."""
         return self.unexplained_mean_square_m2 / self.position_mean_square_m2
 
 
@@ -397,9 +397,10 @@ def _find_longest_rejection(
     span: Span,
     spans_s: Spans,
 ) -> RejectionSeries | None:
-    """Return the longest series of rejected positions in the time ``span`` and in ``spans_s``.
+    """Return the longest series of successive positions that EKF2 rejected.
 
-    The replays with and without rejections, ``baseline_replay`` and
+    Only fusion times in ``span`` (times of the compared states) and in ``spans_s`` (evaluated parts
+    of the replay) are searched. The replays with and without rejections, ``baseline_replay`` and
     ``fusion_horizon_track_without_gate``, give the effect of the series on the position.
     """
     updates = rows_inside(baseline_replay.updates, spans_s)

@@ -36,7 +36,7 @@ MAX_REJECTION_DURATION_S = 1.0
 def _group_vision_by_event(
     batch: FilterBatch, event_steps: IntArray, configuration: FilterConfiguration
 ) -> Array:
-    """Group the vision samples of one filter by event.
+    """Group the vision samples of one filter configuration by fusion event.
 
     Each event fuses the samples since the previous event.
 
@@ -145,9 +145,9 @@ class VisionFilter:
         self.was_gnss_off = self.is_gnss_off[0]
 
     def make_update_table(self, configuration_index: int, end_s: Array) -> pd.DataFrame:
-        """Return a table of one configuration's vision updates, one row per sample.
+        """Return a table of the vision updates of a filter configuration, one row per sample.
 
-        ``end_s`` contains the time (s) of each event.
+        ``end_s`` contains the time (s) of each fusion event.
         """
         return make_update_table(
             self.update_records[..., configuration_index],
@@ -159,7 +159,7 @@ class VisionFilter:
     def fuse(
         self, event: int, x: Array, P: Array, is_after_gnss_fusion: bool, last_gnss_fusion_s: Array
     ) -> ArrayPair:
-        """Fuse the vision samples of one event; return x and P.
+        """Fuse the vision samples of one fusion event; return x and P.
 
         ``is_after_gnss_fusion`` is True for the samples that EKF2 fuses after GNSS.
 
@@ -267,7 +267,8 @@ def set_states(
 ) -> None:
     """Set value and variance of the states ``rows``, and set their correlations to zero.
 
-    Only the selected filters change. ``value`` and ``variance`` have the shape (filters, states).
+    Only the selected filter configurations change. ``value`` and ``variance`` have the shape
+    (filters, states).
     """
     x[is_selected, rows] = value[is_selected]
     P[is_selected, :, rows] = 0.0

@@ -167,7 +167,7 @@ class Ekf2Statistics(Record, kw_only=True, omit_defaults=False):
 
     @property
     def nis_mean(self) -> float:
-        """Mean NIS over north and east."""
+        """Mean NIS of EKF2's horizontal position innovations, over north and east."""
         return float(np.mean([axis.nis_mean for axis in self.axes.values()]))
 
     @property
@@ -346,7 +346,7 @@ def _mark_unpredictable_statistics(
 def _has_few_rejections(summary: Ekf2Statistics) -> bool:
     """Return True if EKF2 rejects so few samples that the model can predict the rejections.
 
-    The rejected positions of a replay with the logged parameters are not counted.
+    Rejections of the position source are counted only in replays with changed parameters.
     """
     rejected_fractions = [aid.rejected_fraction for aid in summary.others.values()]
     if summary.changed:
@@ -480,7 +480,7 @@ def _make_summary(
     headings_rad: pd.Series,
     **other_fields: Any,
 ) -> Ekf2Statistics:
-    """Return EKF2's statistics in the evaluated time, from the log or from a replay.
+    """Return statistics of EKF2's innovations, reported σ and position errors.
 
     Parameters
     ----------

@@ -46,7 +46,11 @@ MAX_EXACT_INTEGER = 2.0**52
 
 @dataclass
 class ArrayEncoder:
-    """Encoder of arrays: scale, and differences of successive rounded values, of each array."""
+    """Encoder of the arrays for the web page.
+
+    Each array is stored as scale, and differences of successive values that are rounded to
+    integers.
+    """
 
     _encoded_arrays: list[tuple[float, list[int]]] = field(default_factory=list)
 
@@ -119,7 +123,7 @@ def make_kf_inputs(comparison: Comparison, encoder: ArrayEncoder) -> PageData:
 
 
 def _find_estimated_offset(analysis: Analysis) -> float | None:
-    """Return the maximum-likelihood estimate of the time offset (s), or None."""
+    """Return the estimated time offset (s) of the position source, if it is determinable."""
     estimate = analysis.time_offset
     if isinstance(estimate, SourceTimeOffset) and estimate.is_determinable:
         return analysis.settings.clock_offset_s + estimate.remaining_s
@@ -243,9 +247,10 @@ def _make_truth_data(result: AxisComparison, encoder: ArrayEncoder) -> PageData 
 def _pack_series(
     time_s: ArrayLike, columns: Iterable[ArrayLike], encoder: ArrayEncoder
 ) -> list[dict[str, int]]:
-    """Encode times, and columns rounded to 6 decimals because the page only draws or averages them.
+    """Encode a time series that the web page only draws or averages.
 
-    KF on the page does not use these columns.
+    The values are rounded to 6 decimals. The inputs of KF, which runs in the page, need more
+    digits.
     """
     values = [
         encoder.add(np.asarray(column), DRAWN_VALUE_ROUNDING_STEPS_PER_UNIT) for column in columns

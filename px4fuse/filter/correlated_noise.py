@@ -178,10 +178,13 @@ def _fit_low_pass(
     start_parameters: NoiseParameters,
     white_noise_score: float,
 ) -> SourceLowPass:
-    """Fit a low-pass filter to positions with the median interval ``interval_s``."""
+    """Fit the time constant of a low-pass filter that the source applied to its positions.
+
+    ``interval_s`` is the median interval of the positions.
+    """
 
     def fit_noises(log_tau: float) -> tuple[float, float]:
-        """Return the score (-ln p) and SIGMA_Z for a given time constant."""
+        """Return -ln p and the estimated SIGMA_Z for a time constant of the filter."""
         # -ln p of the measured positions = -ln p of the unfiltered positions - ln |Jacobian|
         motion, minus_log_jacobian = undo_low_pass(float(np.exp(log_tau)))
         # The times of the positions are the same for each τ. fit_time_correlation has computed the

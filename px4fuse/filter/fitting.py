@@ -192,10 +192,10 @@ def _interpolate_between_nodes(coordinate: float) -> tuple[int, Array]:
 def add_noises(
     positions: PositionsAndIncrements, noise_parameters: NoiseParameters, measurement_weights: Array
 ) -> tuple[PositionsAndIncrements, Array]:
-    """Add random walk and time-correlated noise; return also the variance of each measurement.
+    """Add random walk and time-correlated noise to the noise model of the positions.
 
-    ``measurement_weights`` may omit the first rows of the positions, which are initial states
-    without a measurement. Their variance has no effect.
+    Return also the variance of each measurement. ``measurement_weights`` may omit the first rows of
+    the positions, which are initial states without a measurement. Their variance has no effect.
     """
     process_noise = positions.process_noise_independent_of_sigma_a.copy()
     process_noise[0] += positions.interval_s * noise_parameters.random_walk_m**2
@@ -285,7 +285,10 @@ class OutlierDistribution(NamedTuple):
         return np.asarray(expit(log_odds + 0.5 * normalised_squares * (1.0 - self.sigma_ratio**-2)))
 
     def compute_weights(self, outlier_probability: Array) -> Array:
-        """Return the weights: 1 for a good measurement, 1 / ratio² for an outlier."""
+        """Return the weight of each measurement: SIGMA_Z² ÷ variance of the measurement.
+
+        It is 1 for a good measurement, and 1 / ``sigma_ratio``² for an outlier.
+        """
         return 1.0 - outlier_probability * (1.0 - self.sigma_ratio**-2)
 
 
@@ -526,11 +529,13 @@ def compute_variance_factor_of_ln_sigma_z(
     outlier_probability: Array,
     outlier_sigma_ratio: float,
 ) -> float:
-    """Return the factor (at least 1) by which unknown outliers increase the variance of ln SIGMA_Z.
+    """Return the variance of ln SIGMA_Z ÷ its variance if all outliers were known.
 
-    With a factor of 1, the variance is as small as if it were known which measurements are
-    outliers. Method: missing information (Louis 1982). ``normalised_squares`` contains the squared
-    error of each measurement ÷ SIGMA_Z², summed over its ``measured_axis_counts`` axes.
+    It is not known which measurements are outliers. This increases the variance of the estimate of
+    ln SIGMA_Z, so the factor is at least 1. Method: missing information (Louis 1982).
+
+    ``normalised_squares`` contains the squared error of each measurement ÷ SIGMA_Z², summed over
+    its ``measured_axis_counts`` axes.
     """
     # A measurement with the standard deviation σ (SIGMA_Z, or ratio · SIGMA_Z for an outlier) has
     # the information 2 on ln σ for each axis. An outlier depends on ln SIGMA_Z and on ln ratio

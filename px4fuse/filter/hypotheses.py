@@ -218,7 +218,7 @@ def fit_systematic_errors(
 def _fit_sigma_a(
     design_matrix: DesignMatrix, tested_sigmas_a: list[float], is_skipped: BoolArray
 ) -> tuple[DesignMatrix, InnovationRegression]:
-    """Fit the regression with each tested SIGMA_A.
+    """Fit the regression of KF's innovations with each tested SIGMA_A.
 
     Return the design matrix for the most likely SIGMA_A, and the least squares fit with it.
     """
@@ -239,7 +239,11 @@ def _find_minimum(compute_score: Callable[[int], float], count: int) -> int:
 
 
 def _fit_scale(design_matrix: DesignMatrix, is_skipped: BoolArray) -> Estimate:
-    """Estimate the scale factor error of the positions from fits with several scale factors."""
+    """Estimate the scale factor error of the positions.
+
+    The regression of KF's innovations is repeated with several scale factors of the positions. The
+    best one has the smallest squared residuals.
+    """
     tested_scales = TESTED_SCALE_FACTORS.tolist()
     fit_scale = cache(lambda index: design_matrix.fit(is_skipped, tested_scales[index]))
 
@@ -349,7 +353,7 @@ def _find_significant_jump_times(
     is_skipped: BoolArray,
     candidate_times_s: Array,
 ) -> list[float]:
-    """Return the times of significant jumps, largest χ² first."""
+    """Return the times at which a jump of the positions is significant, largest χ² first."""
     chi_square = _compute_jump_chi_squares(design_matrix, fit, is_skipped, candidate_times_s)
     min_chi_square = chdtri(
         design_matrix.axis_count, MAX_JUMP_FALSE_ALARM_P / len(design_matrix.time_s)
@@ -369,7 +373,11 @@ def _compute_jump_chi_squares(
     is_skipped: BoolArray,
     candidate_times_s: Array,
 ) -> Array:
-    """Return χ² of a jump at each time: the decrease of the sum of squared residuals."""
+    """Return χ² of a jump of the positions at each candidate time.
+
+    χ² is the decrease of the sum of squared residuals when the jump is added to the regression of
+    KF's innovations. ``is_skipped`` is True for measurements that the regression omits.
+    """
     # Score test: a jump is not fitted. The innovations due to a jump of 1 m (jump_response) are
     # compared with the residuals of the fit without the jump
     _, columns = design_matrix.compute_innovations_and_design_matrix(fit_without_jump.gains)
@@ -407,7 +415,11 @@ def _compute_jump_chi_squares(
 def _locate_jump(
     design_matrix: DesignMatrix, is_skipped: BoolArray, jump: Jump
 ) -> tuple[Jump, BoolArray]:
-    """Return a detected jump with its exact time and size (m), and a mask of outliers."""
+    """Return a detected jump of the positions with its exact time and size (m).
+
+    Return also the measurements that the regression omits, with outliers near the jump tested
+    again.
+    """
     time_s = design_matrix.time_s
     is_near_jump = np.abs(time_s - jump.time_s) <= OUTLIER_BURST_DURATION_S
     is_after_jump = ~is_near_jump & _is_in_window(
@@ -455,7 +467,10 @@ def _test_jump(
     jump_time_s: float,
     max_false_alarm_p: float,
 ) -> Jump | None:
-    """Test for a jump, and return it if it is significant."""
+    """Return a jump of the positions at a given time, or None if it is not significant.
+
+    The false alarm probability of the χ² test is ``max_false_alarm_p``.
+    """
     is_after_jump = design_matrix.time_s[~is_skipped] >= jump_time_s
     if (
         min(np.count_nonzero(is_after_jump), np.count_nonzero(~is_after_jump))
@@ -507,16 +522,18 @@ class InnovationRegression:
     gains: Array
 
     def compute_residual_squares(self) -> Array:
-        """Return the squared residual of each measurement, summed over axes.
+        """Return the squared normalised residual of each measurement, summed over the axes.
 
-        If the RMS of all residuals exceeds 1, which is its expected value, they are divided by it.
+        The expected RMS of the normalised residuals is 1. If the actual RMS is larger, they are
+        divided by it.
         """
         return np.asarray(np.sum(self.residual**2, axis=0)) / max(self.residual_rms, 1.0) ** 2
 
     def estimate(self, column: int) -> Estimate:
-        """Return the estimated error of one column of the design matrix, and its σ.
+        """Return the estimated error (such as a bias) of a design matrix column, and its σ.
 
-        σ is multiplied by the RMS of the residuals if it exceeds 1, which is its expected value.
+        The expected RMS of the normalised residuals is 1. If the actual RMS is larger, σ is
+        multiplied by it.
         """
         sigma = math.sqrt(self.covariance[column, column]) * max(self.residual_rms, 1.0)
         return Estimate(float(self.coefficients[column]), sigma)
@@ -533,9 +550,11 @@ class DesignMatrix:
     time_s : ndarray, shape (m,)
         Timestamps of the measurements.
     preintegrated_inputs : PreintegratedMotion
-        Inputs for which KF's innovations are computed, one in each column. For each axis: flight
-        data, then the effects of a forward bias, a right bias and a yaw rotation of size 1. Last
-        columns, equal for all axes: slow acceleration error of 1 m/s² at one knot each.
+        Inputs for which KF's innovations are computed; each column is one input. For each axis:
+        flight data, then the effects of 1 m/s² forward accelerometer bias, 1 m/s² right
+        accelerometer bias and 1 rad yaw of the position frame. Last columns, equal for all axes:
+        slow acceleration errors, which are linear between knots in time. Each of these errors is 1
+        m/s² at one knot and 0 at the others.
     prior_sigma : ndarray, shape (k,)
         Prior σ of the estimated errors, except jumps.
     """
@@ -551,7 +570,7 @@ class DesignMatrix:
     def fit_with_jump(
         self, jump_time_s: float, is_skipped: BoolArray
     ) -> tuple[InnovationRegression, list[int]]:
-        """Fit the regression with one more jump.
+        """Fit KF's innovations with one more jump of the positions.
 
         Return also the column index of this jump in the design matrix, for each axis.
         """
@@ -583,10 +602,11 @@ class DesignMatrix:
         return np.asarray(nu / np.sqrt(s)[:, None])
 
     def fit(self, is_skipped: BoolArray, scale: float = 1.0) -> InnovationRegression:
-        """Fit biases, rotation, slow error and jumps to KF's innovations by least squares.
+        """Fit the errors of IMU and positions to KF's innovations by least squares.
 
-        ``scale`` is a trial scale factor of the positions; the acceleration is multiplied by it.
-        ``is_skipped`` is True for measurements that are not used.
+        The errors are accelerometer biases, yaw of the position frame, slow acceleration error and
+        jumps of the positions. ``scale`` is a trial scale factor of the positions; the acceleration
+        is multiplied by it. ``is_skipped`` is True for measurements that are not used.
         """
         # 1. Normalised innovations and design matrix
         gains = compute_gains(
@@ -626,10 +646,11 @@ class DesignMatrix:
         )
 
     def compute_innovations_and_design_matrix(self, gains: Array, scale: float = 1.0) -> ArrayPair:
-        """Return KF's normalised innovations ν/√S, and the design matrix.
+        """Return KF's normalised innovations ν/√S, and the design matrix of their regression.
 
-        The design matrix has the shape (axes · m, k): measurements along the first axis, then those
-        along the next axis.
+        Each column of the design matrix contains the normalised innovations due to one error of
+        size 1. Its shape is (axes · m, k): measurements along the first axis, then those along the
+        next axis.
         """
         inputs, axis_count = self.preintegrated_inputs, self.axis_count
         axis_input_count = INPUTS_PER_AXIS * axis_count
@@ -671,9 +692,11 @@ def make_design_matrix(
     sigma_z_m: float,
     clock_offset_s: float,
 ) -> DesignMatrix | Unavailable:
-    """Make the design matrix of biases, rotation and slow acceleration error, without jumps.
+    """Make the design matrix for the regression of KF's innovations on systematic errors.
 
-    ``clock_offset_s`` is added to the timestamps of the positions.
+    The errors are accelerometer biases, yaw of the position frame, and a slow acceleration error
+    along each axis. Jumps of the positions are added later. ``clock_offset_s`` is added to the
+    timestamps of the positions.
     """
     acceleration, attitude = axes[0].acceleration, flight.attitude
     if isinstance(acceleration, Unavailable):

@@ -178,10 +178,11 @@ class PositionsAndImuMotion:
         )
 
     def make_positions_and_increments(self, time_offsets_s: Array) -> PositionsAndIncrements:
-        """Return the positions, and for each time offset the IMU increments Δp and Δv between them.
+        """Return the positions, and the IMU increments Δp and Δv between them.
 
-        The derivatives with respect to the scale factor are zero. A fit to the result therefore
-        assumes that the scale factor of the positions is 1.
+        The increments have one row for each time offset. Their derivatives with respect to the
+        scale factor of the positions are zero. A fit to the result therefore assumes a scale factor
+        of 1.
         """
         interval_s = np.diff(self.time_s)
         process_noise_per_sigma_a_squared = self.dt_s * np.stack(
@@ -238,10 +239,11 @@ class PositionsAndImuMotion:
     def make_position_batches(
         self, time_offsets_s: Array, *, estimates_scale: bool = True
     ) -> Iterator[PositionsAndIncrements]:
-        """Yield positions and IMU increments for all time offsets, a few segments at once.
+        """Yield positions and IMU increments of a few flight segments at once.
 
-        With ``estimates_scale``, the scale factor of the positions can be estimated: a smooth path
-        through the positions is subtracted, and becomes the derivative for the scale factor error.
+        The increments have one row for each time offset. With ``estimates_scale``, a fit to them
+        also estimates the scale factor of the positions, see
+        :func:`~px4fuse.filter.marginal_likelihood.subtract_smooth_path`.
         """
         element_count = (
             len(time_offsets_s) * self.measurement_m.size * len(PRIOR_SIGMAS_OF_CONSTANT_ERRORS)
@@ -269,7 +271,10 @@ class PositionsAndImuMotion:
     def fit_at_offsets(
         self, time_offsets_s: Array, noise_parameters: NoiseParameters
     ) -> PositionFit:
-        """Fit the constant errors to the positions, for each time offset."""
+        """Fit the constant errors of attitude and IMU (such as biases) for each time offset.
+
+        The reference are the positions, shifted by the time offset.
+        """
         return fit_constant_errors(
             self.make_position_batches(time_offsets_s), noise_parameters, self.measurement_weights
         )
@@ -277,7 +282,10 @@ class PositionsAndImuMotion:
     def fit_noises(
         self, offset_s: float, start_parameters: NoiseParameters, *, fits_outliers: bool = False
     ) -> NoiseFit:
-        """Estimate the noises (and the outliers) with one time offset."""
+        """Estimate the noises of IMU and positions for a given time offset of the positions.
+
+        With ``fits_outliers``, the fraction and σ of outliers are estimated, too.
+        """
         return maximise_likelihood(
             [self.make_positions_at_offset(offset_s)],
             start_parameters,
@@ -294,9 +302,10 @@ class PositionsAndImuMotion:
     ) -> tuple[float, NoiseParameters]:
         """Return the most likely time offset (s), and the noises with the most likely SIGMA_A.
 
-        Each time offset of a coarse grid is tested with each SIGMA_A: that of ``noise_parameters``
-        times each of ``sigma_a_factors``. The other noises are not changed. The scale factor of the
-        positions is estimated with ``estimates_scale``, otherwise it is 1.
+        Each time offset of a coarse grid is tested with several values of SIGMA_A: the value in
+        ``noise_parameters``, multiplied by each of ``sigma_a_factors``. The other noises are not
+        changed. With ``estimates_scale``, the scale factor of the positions is estimated; otherwise
+        it is 1.
         """
         tested_offsets_s = np.linspace(
             -MAX_TESTED_TIME_OFFSET_S, MAX_TESTED_TIME_OFFSET_S, COARSE_OFFSET_COUNT

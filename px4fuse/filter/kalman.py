@@ -66,13 +66,17 @@ class KfRun:
 
 
 def run_kf(axis: Axis, settings: Settings, *, fast: bool = False) -> KfRun:
-    """Run KF along one axis. The initial position is the first measurement, the velocity is zero.
+    """Run KF along one axis.
+
+    The initial position is the first measurement, the initial velocity is zero.
 
     Parameters
     ----------
+    axis : Axis
+        Measured positions, and acceleration as input of KF.
     fast : bool
-        True to compute with Python floats, for many re-runs (faster, equal results). By default,
-        KF is computed with filterpy, as in the lesson.
+        True to compute with Python floats, for many re-runs (faster, equal results). By default, KF
+        is computed with the library filterpy.
 
     Raises
     ------

@@ -1,7 +1,8 @@
-"""KF with one prediction per measurement, and 95 % likelihood intervals of its noises.
+"""KF with one prediction per measurement, and 95 % intervals of SIGMA_A and SIGMA_Z.
 
-The acceleration is first integrated between measurements, which is faster. If all σ are at least
-1e-3, the innovations equal those of :mod:`px4fuse.filter.kalman` to 1e-9.
+The intervals are from the likelihood of KF's innovations. The acceleration is first integrated
+between measurements, which is faster. If SIGMA_A and SIGMA_Z are at least 1e-3, the innovations
+equal those of :mod:`px4fuse.filter.kalman` to 1e-9.
 """
 
 from collections.abc import Callable

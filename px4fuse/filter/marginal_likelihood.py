@@ -7,10 +7,10 @@ For given constants, position and velocity at the measurement times are estimate
 from the measured positions and the IMU acceleration. The normal equations Ax = b have a banded
 matrix A. The resulting likelihood equals the likelihood of KF's innovations (Schweppe 1965).
 
-The constants are estimated by linear regression of the data on the derivatives of the data with
-respect to each constant. The data and these derivatives are called inputs. The data consist of
-measured positions and IMU increments. The Gram matrix contains the inner products of all pairs of
-inputs, weighted by the inverse covariance.
+The constants are estimated by linear regression. The dependent variable is the data: measured
+positions and IMU increments. The regressors are the derivatives of the data with respect to each
+constant. The data and the regressors are called the inputs of the regression. The Gram matrix
+contains the inner products of all pairs of inputs, weighted by the inverse covariance of the data.
 
 Symbols in shapes: m measurements, a axes, s segments, T time offsets, c constants.
 """
@@ -111,10 +111,10 @@ class PositionsAndIncrements:
     def factorise_equations(
         self, sigma_a_m_s2: float, variance_m2: Array
     ) -> Iterator[tuple[list[int], BandedNormalEquations, int]]:
-        """Factorise the normal equations of positions and velocities, for each group of axes.
+        """Factorise the normal equations for position and velocity at the measurement times.
 
-        Axes with the same measurement times form one group, because their equations are equal.
-        Yield axis indices, equations, and degrees of freedom of one axis.
+        Axes with measurements at the same times have the same matrix, so they form one group. Yield
+        the axis indices and the equations of each group, and the degrees of freedom of one axis.
         """
         is_measured = np.isfinite(self.measurement_m)
         process_noise = (
@@ -175,8 +175,8 @@ class PositionFit:
     Attributes
     ----------
     gram_matrix : ndarray, shape (segments, time offsets, 1 + c, 1 + c)
-        Inner products of all pairs of inputs, weighted by the inverse covariance. The inputs are
-        the data, then their derivatives with respect to each constant error.
+        Weighted inner products of all pairs of inputs of the regression. The inputs are the data
+        (positions and IMU increments), then their derivative with respect to each constant error.
     covariance_log_determinant : float
         Log determinant of the covariance of the positions.
     degrees_of_freedom : int
@@ -191,7 +191,10 @@ class PositionFit:
     prior_sigmas_of_constant_errors: Array
 
     def compute_constant_error_information(self) -> Array:
-        """Return information matrices of the constant errors, shape (segments, offsets, c, c)."""
+        """Return the information matrix of the c constant errors (such as biases).
+
+        The shape is (segments, time offsets, c, c).
+        """
         return self.gram_matrix[..., 1:, 1:] + np.diag(self.prior_sigmas_of_constant_errors**-2.0)
 
     def estimate_constant_errors_by_segment(self) -> Array:
@@ -251,12 +254,12 @@ def fit_positions(
 ) -> PositionFit:
     """Fit constant errors (such as biases) to positions, with given SIGMA_A and variances.
 
-    The inputs of this regression are the data, and the derivatives of the data with respect to
-    each constant error. Each input consists of positions and IMU increments Δp and Δv. Constant
-    errors change the increments only, so the derivatives have zero positions.
+    The inputs of this regression are the data, then the derivative of the data with respect to each
+    constant error. Each input consists of positions and of IMU increments Δp and Δv. Constant
+    errors change only the increments, so the positions of the derivatives are zero.
 
-    By default, only the first input, the data, has positions. To give positions to the first k
-    inputs, pass them as ``measured_m``, shape (axes, 1 or time offsets, k, measurements).
+    ``measured_m``, shape (axes, 1 or time offsets, k, measurements), contains the positions of the
+    first k inputs. By default, k is 1: the measured positions.
     """
     if measured_m is None:
         measured_m = np.nan_to_num(positions.measurement_m.T)[:, None, None]
@@ -306,9 +309,9 @@ def _compute_inner_products(left: Array, right: Array, segment_edges: IntArray) 
     """Return the inner products of all rows of ``left`` with all rows of ``right``.
 
     The products are summed over the axes, separately for each segment. ``left`` and ``right`` have
-    the shape (axes, ..., rows, values), with one row for each input of the regression.
-    ``segment_edges`` contains the index of the first value of each segment, then the end of the
-    last segment.
+    the shape (axes, ..., rows, values). Each row is one input of the regression in
+    :func:`fit_positions`. ``segment_edges`` contains the index of the first value of each segment,
+    then the end of the last segment.
     """
     right = np.swapaxes(right, -1, -2)
     products = [
@@ -323,9 +326,9 @@ def subtract_smooth_path(
 ) -> PositionsAndIncrements:
     """Subtract a smooth path through the positions from the positions and the IMU increments.
 
-    The remaining numbers are small and have small rounding errors. A scale factor error changes the
-    data in proportion to the path. With ``estimates_scale``, the increments of the path therefore
-    become the derivative of the data with respect to the scale factor error.
+    The remaining numbers are small and have small rounding errors. With ``estimates_scale``, also
+    set the derivative of the data with respect to a scale factor error of the positions. Such an
+    error changes the data in proportion to the path, so the derivative is the path.
     """
     measured_m = positions.measurement_m.copy()
     dp = positions.delta_position_m.copy()
@@ -404,9 +407,9 @@ def compute_segment_inner_products(
 ) -> Array:
     """Return k inner products uᵀC⁻¹v in each segment, shape (segments, k).
 
-    Each u and each v is a series of positions with the IMU increments Δp and Δv between them. C is
-    the covariance of measured positions, given the measured acceleration. It includes unknown
-    constant errors (such as biases).
+    Each u and each v is a vector like the data: a position at each measurement, and IMU increments
+    Δp and Δv between them. C is the covariance of measured positions, given the measured
+    acceleration. It includes unknown constant errors (such as biases).
 
     Parameters
     ----------
@@ -486,7 +489,10 @@ class BandedNormalEquations:
 
     @property
     def state_count(self) -> int:
-        """2 (position, velocity), or 3 with time-correlated noise."""
+        """Number of estimated states at each measurement.
+
+        2 (position, velocity), or 3 with time-correlated noise.
+        """
         return len(self.bands) - 2
 
     def weight_increments(self, delta_position_m: Array, delta_velocity_m_s: Array) -> ArrayPair:
@@ -498,10 +504,10 @@ class BandedNormalEquations:
         )
 
     def whiten_explained_part(self, measured_m: Array, *weighted_increments: Array) -> Array:
-        """Return L⁻¹b for each input, shape (..., values), with Ax = b and A = LLᵀ.
+        """Return L⁻¹b for each input of the regression, with Ax = b and A = LLᵀ.
 
-        The inner product of two results, b₁ᵀA⁻¹b₂, is the part of the weighted inner product of two
-        inputs that the estimated states x explain.
+        The shape is (..., values). The inner product of two results, b₁ᵀA⁻¹b₂, is the part of the
+        weighted inner product of the two inputs that position and velocity x explain.
         """
         right_hand_side = self._make_right_hand_side(measured_m, *weighted_increments)
         # LAPACK solves a triangular system with unit diagonal 30 % faster. With L = UD, D the
@@ -516,9 +522,10 @@ class BandedNormalEquations:
         )
 
     def solve(self, measured_m: Array, delta_position_m: Array, delta_velocity_m_s: Array) -> Array:
-        """Return the estimated states, shape (..., measurements, states).
+        """Return the least-squares estimate x of the states at the measurements.
 
-        States: position (m), velocity (m/s), and time-correlated noise (m) if it is fitted.
+        The shape is (..., measurements, states). States: position (m), velocity (m/s), and
+        time-correlated noise (m) if it is fitted.
         """
         right_hand_side = self._make_right_hand_side(
             measured_m, *self.weight_increments(delta_position_m, delta_velocity_m_s)
@@ -529,9 +536,9 @@ class BandedNormalEquations:
     def _make_right_hand_side(
         self, measured_m: Array, weighted_dp: Array, weighted_dv: Array
     ) -> Array:
-        """Return the right-hand side b of Ax = b.
+        """Return the right-hand side b of the normal equations Ax = b.
 
-        ``weighted_dp`` and ``weighted_dv`` are Q⁻¹ [Δp, Δv].
+        ``weighted_dp`` and ``weighted_dv`` are the IMU increments Δp and Δv, multiplied by Q⁻¹.
         """
         # Interval i has the prediction residual r = x_(i+1) - F x_i - Δ and the cost rᵀQ⁻¹r. Its
         # derivative adds Q⁻¹Δ to the rows of x_(i+1), and -FᵀQ⁻¹Δ to the rows of x_i.

@@ -113,12 +113,13 @@ class Axis:
     Attributes
     ----------
     name : {"north", "east", "down", "aisle"}
+        "aisle" is the horizontal axis of largest motion, or that of the user's heading.
     direction : ndarray, shape (3,)
         Unit vector in NED.
     heading_deg : float or None
         Heading of a horizontal axis, clockwise from north.
     note : str
-        Explanation of the aisle's heading for the user.
+        Explanation for the user how the heading of the axis "aisle" was determined.
     acceleration : Acceleration or Unavailable
         Input of KF.
     """
@@ -303,7 +304,7 @@ def report_too_few_measurements(
 
 
 def weighted_sum(samples: pd.DataFrame, columns: list[str], weights: Array) -> Array:
-    """Return the weighted sum of columns. A column with weight zero may contain NaN."""
+    """Return the weighted sum of table columns. A column with weight zero may contain NaN."""
     weighted_total = np.zeros(len(samples))
     for column, weight in zip(columns, weights, strict=True):
         if weight != 0.0:
@@ -328,7 +329,7 @@ def _choose_axis_direction(
 def integrate_ned_acceleration(
     acceleration: pd.DataFrame | Unavailable, segment: Segment
 ) -> Acceleration | Unavailable:
-    """Integrate the acceleration (m/s², NED) of the whole flight."""
+    """Return the acceleration (m/s², NED) of the whole flight, with its integral over time."""
     if isinstance(acceleration, Unavailable):
         return acceleration
     time_s = acceleration.index.to_numpy()

@@ -26,7 +26,8 @@ class PredictionSteps:
     measurement_index : ndarray of int, shape (n,)
         Index of the measurement at each time, or -1.
     last_steps : ndarray of int, shape (m,)
-        Index of the time of each measurement. An interval between measurements ends there.
+        Index in ``time_s`` of each measurement, which is the end of the interval since the previous
+        measurement.
     interval_index : ndarray of int, shape (n - 1,)
         Index of the interval between measurements that contains each prediction step.
     acceleration_m_s2 : ndarray, shape (n - 1,)
@@ -46,7 +47,10 @@ class PredictionSteps:
     input_gap_s: float
 
     def compute_time_to_interval_end_s(self) -> Array:
-        """Return the time (s) from the end of each step to the end of its interval."""
+        """Return the time (s) from the end of each prediction step to the next measurement.
+
+        It is 0 for a step that ends at a measurement.
+        """
         return self.time_s[self.last_steps[self.interval_index]] - self.time_s[1:]
 
 

@@ -3,8 +3,8 @@
 The likelihood of the positions given the acceleration is maximised over time offset and noises.
 Biases, tilt and scale are estimated too, because their effects are similar.
 
-IMU noise increases the variance of the time offset. The factor is simulated, and widens the 95 %
-interval (sandwich estimate, White 1982).
+IMU noise increases the variance of the estimated time offset. The increase is simulated, and the
+95 % interval is widened accordingly (sandwich estimate, White 1982).
 """
 
 from collections.abc import Callable
@@ -78,7 +78,7 @@ SIMULATED_SEGMENT_GROUP_COUNT, FLIGHT_SEGMENTS_PER_SIMULATED_GROUP = 96, 12
 
 
 class FlightPartTimeOffset(Record):
-    """Time offset in one part of the flight."""
+    """Time offset of the position source in one part of the flight, with its σ."""
 
     start_s: float
     end_s: float
@@ -127,7 +127,7 @@ class SourceTimeOffset(Record, kw_only=True):
 
     @property
     def remaining_s(self) -> float:
-        """Estimated offset (s) minus the offset that was already added."""
+        """Estimated time offset (s) minus the offset that is already in the timestamps."""
         return self.offset_s - self.applied_s
 
     @property
@@ -135,14 +135,14 @@ class SourceTimeOffset(Record, kw_only=True):
         return MIN_OFFSET_SIGMAS * self.sigma_s
 
     def has_changed(self) -> bool:
-        """Return True if the offset changes significantly in flight."""
+        """Return True if the time offset of the source changes significantly in flight."""
         if self.change_p_value is None or self.change_p_value >= MAX_P_VALUE_OF_CHANGED_OFFSET:
             return False
         return abs(self.parts[-1].offset_s - self.parts[0].offset_s) >= MIN_TIME_OFFSET_CHANGE_S
 
     @property
     def min_significant_offset_s(self) -> float:
-        """Time offset (s) above which an offset is significant."""
+        """Smallest significant time offset (s)."""
         return max(MIN_TIME_OFFSET_S, self.significance_limit_s)
 
     def is_significant(self, offset_s: float) -> bool:
@@ -266,7 +266,7 @@ def estimate_time_offset(
 
 
 class _LikelihoodCurve(NamedTuple):
-    """-ln p (score) of the positions at time offsets, and an interval (s) around the minimum.
+    """-ln p (score) of the positions at time offsets, and the 95 % interval (s) of the offset.
 
     An end of the interval outside the search range is None.
     """
@@ -277,7 +277,11 @@ class _LikelihoodCurve(NamedTuple):
     high_s: float | None
 
     def widen_interval(self, offset_s: float, additional_half_width_s: float) -> Span:
-        """Return the interval with an additional independent error."""
+        """Return the interval of the time offset, widened by an independent error.
+
+        ``offset_s`` is the estimated time offset. ``additional_half_width_s`` is half the width of
+        the 95 % interval of the independent error.
+        """
         low_s = self.offsets_s[0] if self.low_s is None else self.low_s
         high_s = self.offsets_s[-1] if self.high_s is None else self.high_s
         low_half_width_s, high_half_width_s = np.hypot(
@@ -298,7 +302,8 @@ def _compute_offset_likelihood_curve(
     """Compute -ln p of the positions as a function of the time offset.
 
     ``tested_scores`` contains -ln p of ``tested_offsets_s``. The curve is widened until it contains
-    both ends of the interval.
+    both ends of the 95 % interval of the time offset. At the ends, -ln p exceeds its minimum by
+    ``max_score_increase``.
     """
     while True:
         offsets_s = _make_offset_grid(offset_s, half_width_s, LIKELIHOOD_CURVE_POINT_COUNT)
@@ -339,9 +344,10 @@ def _simulate_variance_increase_by_imu_noise(
     Without IMU noise, the variance is 1 / ``fisher_information``. IMU noise is in the residuals and
     in the velocity, so its effect is not negligible.
 
-    Method: the score (derivative of the log-likelihood) is the inner product of residuals and
-    velocity. Simulated residuals and the velocity noise of the same simulation give the additional
-    variance of the score of each group of segments.
+    Method: the score (derivative of the log-likelihood with respect to the time offset) is the
+    inner product of position residuals and velocity. With simulated noise, the inner product of
+    residuals and velocity noise is the error of the score. Its variance is computed for groups of
+    flight segments and added over the groups.
     """
     # 1. Draw noise: noise_series_count independent series for each axis and measurement or interval
     positions_at_offset = imu_motion.make_positions_at_offset(offset_s)
@@ -414,10 +420,11 @@ def _estimate_flight_part_offsets(
     offset_variance_factor: float,
     applied_offset_s: float,
 ) -> tuple[tuple[FlightPartTimeOffset, ...], float | None]:
-    """Estimate the time offset of each flight segment, and test for a constant offset.
+    """Estimate the time offset of the source in each flight segment.
 
-    ``applied_offset_s`` (s) is added to each offset. Return also the p-value of the test; None with
-    fewer than two offsets.
+    Return also the p-value of a test for a constant time offset; None with fewer than two
+    estimates. ``applied_offset_s``, which was already added to the timestamps, is added to each
+    estimate.
     """
     # -ln p of each segment at a few time offsets, interpolated to a fine grid
     coarse_offsets_s = offset_s + FLIGHT_PART_OFFSET_DIFFERENCES_S

@@ -150,7 +150,10 @@ class AxisTuning(Record, kw_only=True):
 
     @property
     def sigma_a_two_state(self) -> NoiseEstimate:
-        """Estimated SIGMA_A (m/s²) for KF, including biases and tilt."""
+        """Estimated SIGMA_A (m/s²) for KF, which must also cover biases and tilt errors.
+
+        KF has only two states (position, velocity) and does not estimate these errors.
+        """
         return NoiseEstimate.from_fields(
             self.sigma_a_two_state_m_s2, self.sigma_a_two_state_m_s2_interval
         )

@@ -62,7 +62,10 @@ def classify_cause(analysis: Analysis, cause: Rerun | None) -> str:
 
 
 def rerun_refutes_cause(analysis: Analysis, filter_name: FilterName, cause: Rerun) -> bool:
-    """Return True if a change improves neither σ nor RMSE along the axis of largest motion."""
+    """Return True if a re-run with the suspected cause removed does not improve a filter.
+
+    Neither reported σ nor position RMSE is better along the axis of largest motion.
+    """
     return any(
         (rerun.filter, rerun.change) == (filter_name, cause.change)
         and can_show_improvement(rerun)
@@ -100,7 +103,7 @@ def describe_part_explained_by_change(cause: Rerun, statistic: Statistic) -> str
 
 
 def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
-    """Format the actions that a change of a re-run stands for."""
+    """Format the user's actions that correspond to the changes of a re-run."""
     return " ".join(_list_actions(analysis, change))
 
 
@@ -125,9 +128,9 @@ def _list_actions(analysis: Analysis, change: Mapping[str, float]) -> Iterator[s
 
 
 def format_sender_action(source: PositionTrack, shift_s: float) -> str:
-    """Format the action of the sender for a time offset, without full stop.
+    """Format the action on the sender of the positions that corrects a time offset.
 
-    PX4 ignores the timestamps of a sender that does not answer TIMESYNC.
+    The text has no full stop. PX4 ignores the timestamps of a sender that does not answer TIMESYNC.
     """
     if source.clock_map is not None and source.clock_map.method == "arrival time":
         return (

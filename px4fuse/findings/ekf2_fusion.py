@@ -442,9 +442,9 @@ def _format_aid_label(aid: AidResult) -> str:
 
 
 def _find_shared_sensor_cause(fusion_parameter: str, kf_position_aid: str) -> str:
-    """Return SOURCE_SENSOR_CAUSE if one sensor measures KF's positions and another aiding source.
+    """Return SOURCE_SENSOR_CAUSE if an aiding source is from the sensor of KF's positions.
 
-    Both are from one sensor if the same EKF2 parameter enables their fusion. Otherwise, return "".
+    This is the case if one EKF2 parameter enables the fusion of both. Otherwise, return "".
     """
     if kf_position_aid and AIDS[kf_position_aid].switch == fusion_parameter:
         return SOURCE_SENSOR_CAUSE

@@ -113,7 +113,10 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_wrong_settings(analysis: Analysis) -> Findings:
-    """Detect a SIGMA_A or SIGMA_Z that differs significantly from its estimate."""
+    """Detect KF noise settings that differ significantly from their estimates.
+
+    The settings are SIGMA_A (acceleration noise) and SIGMA_Z (position noise).
+    """
     axis_tuning = find_first_available_tuning(analysis.tuning, HORIZONTAL, "aisle", "down")
     if axis_tuning is None:
         return
@@ -192,7 +195,12 @@ def format_estimate(name: str, setting: float, noise: NoiseEstimate) -> str:
 
 
 def format_setting_action(analysis: Analysis, name: str) -> str:
-    """Return the change that a re-run confirmed, or the reason to change nothing."""
+    """Format the action on a KF noise setting that is wrong according to its estimate.
+
+    The action is the change that a re-run confirmed. Without such a re-run, the text says why the
+    setting is not changed or how to test it. ``name`` is the field of
+    :class:`~px4fuse.filter.settings.Settings`.
+    """
     if rerun := find_rerun(analysis.select_main_reruns(), "kf", "noises", name):
         return format_kf_settings(rerun.change)
     if any(
@@ -449,7 +457,11 @@ def _find_action_for_wrong_sigma(
 def _find_sigma_action_without_replay(
     analysis: Analysis, result: AxisComparison, axis_tuning: AxisTuning
 ) -> str:
-    """Return the change of EKF2's noise to its estimate, if EKF2 cannot be replayed."""
+    """Return the action against a wrong σ of EKF2 if EKF2 cannot be replayed.
+
+    The action sets EKF2's measurement noise to the estimated position noise, if this changes σ in
+    the right direction.
+    """
     aid, noise = find_aid(analysis, result.axis.name), axis_tuning.sigma_z
     ekf2_summary = result.filters["ekf2"]
     assert not isinstance(ekf2_summary, Unavailable)

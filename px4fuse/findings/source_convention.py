@@ -68,9 +68,10 @@ def _make_evidence(convention: Convention, fault: str) -> dict[str, float | str]
 
 
 def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding]) -> list[Finding]:
-    """Remove findings that are only effects of wrong axes, unit, clock or orientation.
+    """Remove findings that are only effects of positions in a wrong convention.
 
-    Findings on EKF2 are kept and marked as effects.
+    The convention comprises axes, unit, clock and orientation. Findings on EKF2 are kept and marked
+    as effects.
     """
     faults = analysis.convention_faults
     cause_findings = [item for item in findings if WRONG_CONVENTION_KEY in item.evidence]

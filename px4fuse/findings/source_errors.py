@@ -317,7 +317,7 @@ def detect_scale_error(analysis: Analysis, error_fit: ErrorFit) -> Findings:
 
 
 def detect_imu_oscillation(analysis: Analysis) -> Findings:
-    """Detect an oscillation of the accelerometer that the positions do not contain."""
+    """Detect an oscillation of the measured acceleration that the positions do not show."""
     if find_low_pass(analysis) is not None:
         # the low-pass filter of the source may have removed the oscillation from the positions
         return

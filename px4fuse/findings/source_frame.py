@@ -1,4 +1,7 @@
-"""Misaligned position frame, heading errors of EKF2, and alignment of a position file."""
+"""Findings on the rotation of the position frame from north, and on EKF2's heading.
+
+A position file with an uncertain alignment also gives a finding.
+"""
 
 import math
 

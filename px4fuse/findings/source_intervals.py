@@ -317,7 +317,10 @@ def _compute_intervals_s(analysis: Analysis) -> tuple[Array, float]:
 
 
 def _find_period(intervals_s: Array) -> tuple[float, Array] | None:
-    """Return the period (s) of the source, and the number of periods in each interval."""
+    """Return the measurement period (s) of the source, and the intervals as multiples of it.
+
+    ``intervals_s`` are the times between received positions. Return None if no period fits.
+    """
     # The upper median is one of the intervals; numpy.median may be the mean of two
     median_interval_s = float(np.sort(intervals_s)[len(intervals_s) // 2])
     for median_count in range(1, MAX_SOURCE_PERIODS_PER_MEDIAN_INTERVAL + 1):

@@ -223,9 +223,9 @@ def _describe_replayed_effect(
 ) -> str | None:
     """Describe EKF2's position RMSE in replays without and with a change of parameters.
 
-    The measured positions are rotated by ``rotation_deg`` (clockwise from above). Both replays use
-    positions that are rotated back. Return "" if no replay or ground truth is available, and None
-    if the change reduces the RMSE too little.
+    ``rotation_deg`` is the detected rotation error of the positions (clockwise from above). Both
+    replays use corrected positions, rotated by -``rotation_deg``. Return "" if no replay or ground
+    truth is available, and None if the change reduces the RMSE too little.
     """
     ekf2_model, truth = analysis.ekf2_model, analysis.flight.truth
     if (
@@ -316,7 +316,10 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
     )
 
     def compute_median_distance_m(positions: pd.DataFrame, delay_s: float) -> float:
-        """Return the median distance (m) of positions from EKF2's position before a delay."""
+        """Return the median distance (m) of positions from EKF2's position at earlier times.
+
+        The times are earlier by ``delay_s``.
+        """
         time_s = positions.index.to_numpy() - delay_s
         is_moving = (
             np.linalg.norm(ekf2_position_spline(time_s, 1), axis=1)

@@ -66,7 +66,10 @@ class SourceOrigin(Record):
 
     @property
     def has_all_samples(self) -> bool:
-        """True if all positions of the sender are available."""
+        """True if the positions are from a file or from the messages that were received.
+
+        Positions in EKF2's logged data are only a part of them.
+        """
         return self.route in ("given file", "as received")
 
     @property
@@ -755,7 +758,8 @@ def rows_between(samples: pd.DataFrame, start_s: float, end_s: float) -> pd.Data
 def compute_sample_rate_hz(samples: pd.DataFrame) -> float:
     """Return the sample rate (Hz) without gaps; NaN for fewer than two samples.
 
-    It is the inverse of the mean interval, because decimated topics have two different intervals.
+    It is the inverse of the mean interval. The median interval would be wrong for downsampled
+    topics, whose intervals alternate between two values.
     """
     if len(samples) < 2:
         return np.nan

@@ -1,4 +1,4 @@
-"""Web page with one table that users can sort, search, filter and unfold."""
+"""Web page with one table. Users can sort, search and filter rows, and show their details."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +22,8 @@ class Column(NamedTuple):
     Attributes
     ----------
     kind : str
-        Type of the cells. "name" unfolds the row; "rank" sorts texts by a number.
+        Type of the cells. A click on a "name" shows or hides the details of the row. "rank" sorts
+        texts by a number.
     group : str
         Check box that shows or hides the column; "" if it is always shown.
     is_on_phones : bool

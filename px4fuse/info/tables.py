@@ -142,7 +142,7 @@ def describe_flight(flight: Flight) -> dict[str, Any]:
 
 
 def _list_tracks_with_table_names(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
-    """Yield each position track with a unique table name."""
+    """Yield each position track with a unique name for its exported table."""
     used_names: set[str] = set()
     for track in flight.positions:
         # the prefix avoids names that Windows reserves (con, aux, ...)

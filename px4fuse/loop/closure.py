@@ -66,7 +66,7 @@ def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
 
 
 def compute_default_key_frame_spacing_m(position_m: Array) -> float:
-    """Return the default key frame spacing (m)."""
+    """Return the default spacing (m) of the key frames along a path, from its extent."""
     spacing_m = KEY_FRAME_SPACING_TO_EXTENT_RATIO * compute_extent_m(position_m)
     return float(np.clip(spacing_m, MIN_KEY_FRAME_SPACING_M, MAX_KEY_FRAME_SPACING_M))
 

@@ -369,7 +369,10 @@ def solve_pose_graphs(
 def _correct_path(
     path: Trajectory, node_indices: IntArray, graph_poses: Array, solved_poses: Array
 ) -> Trajectory:
-    """Correct each pose of a path by interpolation of the corrections of the graph nodes."""
+    """Correct each pose of a path by interpolation of the corrections of the graph nodes.
+
+    ``graph_poses`` are the node poses before, ``solved_poses`` those after optimisation.
+    """
     node_corrections = (
         Rotation.from_quat(solved_poses[:, 3:]) * Rotation.from_quat(graph_poses[:, 3:]).inv()
     )

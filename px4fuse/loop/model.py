@@ -189,7 +189,7 @@ class Loop(Record, kw_only=True):
         }
 
     def select_reported_paths(self) -> tuple[PathResult, ...]:
-        """Return the paths without duplicates."""
+        """Return the uncorrected and the corrected paths of the report, without duplicates."""
         paths = self.find_paths()
         if isinstance(self.heading_error_deg, Unavailable):
             # If the heading error is unknown, the path "by_distance" has only corrected positions,
@@ -198,7 +198,11 @@ class Loop(Record, kw_only=True):
         return tuple(paths.values())
 
     def choose_best_path(self) -> PathResult:
-        """Return the most reliable of the available paths."""
+        """Return the path with the most reliable correction that is available.
+
+        The order is: pose graph without rejected closures, closure error distributed by distance,
+        no correction.
+        """
         paths = self.find_paths()
         return paths.get("pose_graph_gated") or paths.get("by_distance") or paths["uncorrected"]
 

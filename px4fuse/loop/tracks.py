@@ -204,7 +204,7 @@ def read_trajectory_source(
     Parameters
     ----------
     argument : str
-        ``FILE``, ``LOG:TRACK``, ``TABLE:BODY`` or ``BAG:TOPIC``.
+        ``FILE``, ``LOG:TRACK``, ``TABLE:BODY`` (body of a motion capture table) or ``BAG:TOPIC``.
     default_track : {"vio", "ekf2", "kf", "truth"}, optional
         Default track of a flight log.
     frame : Frame, optional

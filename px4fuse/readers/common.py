@@ -64,9 +64,9 @@ _FIELD_TABLES = ("columns", "optional_columns", "scale")
 
 
 def expand_layouts(toml_tables: Mapping[str, Any]) -> dict[str, MessageLayout]:
-    """Convert TOML tables to definitions with one message field per column.
+    """Convert TOML tables to message layouts, with one message field for each column.
 
-    By default, the topic or message is the name of the table.
+    By default, the key of a table is the name of the topic or message.
     """
     rows = {
         name: {"topic": name, **row}

@@ -69,7 +69,7 @@ class _TaggedLines:
             raise _make_line_error(self.file_name, self.lines[row][0], reason, remedy)
 
     def parse(self, id_count: int, value_count: int) -> tuple[IntArray, Array]:
-        """Return the vertex ids, shape (n, id_count), and the other values of all lines.
+        """Parse all lines: vertex ids, shape (n, id_count), and the other values.
 
         Raises
         ------

@@ -131,7 +131,7 @@ def message_name(message_id: int) -> str:
 
 @cache
 def wire_layout(message_id: int) -> np.dtype[Any]:
-    """Return the fields in the payload of a message as a structured dtype without padding."""
+    """Return the payload fields of a MAVLink message as a structured dtype without padding."""
     message = dialect.mavlink_map[message_id]
     # pymavlink and numpy have the same type codes
     type_codes = message.native_format.decode().removeprefix("<")
@@ -216,7 +216,10 @@ def _find_valid_frames(content: bytes) -> Int64Array:
 
 
 def _remove_nested_frames(frames: Int64Array) -> Int64Array:
-    """Remove frames inside other frames, such as in the payload of the message TUNNEL."""
+    """Remove MAVLink frames inside other frames, such as in the payload of message TUNNEL.
+
+    Each row of ``frames`` contains start, end and message id.
+    """
     start_offsets, end_offsets, _ = frames.T
     if np.all(start_offsets[1:] >= end_offsets[:-1]):
         return frames
@@ -240,9 +243,10 @@ def _remove_nested_frames(frames: Int64Array) -> Int64Array:
 
 
 def _find_possible_frames(content: bytes, block_start: int) -> Int64Array:
-    """Find possible frames that begin in one block of the file, without a test of the checksum.
+    """Find possible MAVLink frames that begin in one block of the file.
 
-    Return start, end, message id and checksum offset of each frame, shape (n, 4).
+    Checksums are not tested. Return start, end, message id and checksum offset of each frame, shape
+    (n, 4).
     """
     # Zeros after the end of the file complete its last headers
     byte_count = BLOCK_BYTES + HEADER_BYTES_V2 - 1
@@ -318,9 +322,10 @@ def _count_bytes_outside_frames(
 def _measure_unknown_frame(
     content: bytes, offset: int, gap_end: int, receive_time_size_bytes: int
 ) -> int:
-    """Return the size (bytes) of a frame with an unknown message, with its receive time.
+    """Return the size (bytes) of a MAVLink frame with an unknown message id.
 
-    Return 0 if no such frame begins at the offset.
+    The size includes the receive time before the frame. Return 0 if no such frame begins at the
+    offset.
     """
     header_offset = offset + receive_time_size_bytes
     if header_offset + HEADER_BYTES_V1 > gap_end:
@@ -346,7 +351,10 @@ def _measure_unknown_frame(
 def _read_receive_times(
     content_bytes: ByteArray, start_offsets: Int64Array, end_offsets: Int64Array
 ) -> Int64Array:
-    """Return the receive time (UNIX, µs) of each frame; damaged times are interpolated."""
+    """Return the receive time (UNIX, µs) of each MAVLink frame.
+
+    Times far from the median time are damaged, and are replaced by interpolated times.
+    """
     is_usable = start_offsets >= RECEIVE_TIME_BYTES
     is_usable[1:] &= start_offsets[1:] - end_offsets[:-1] >= RECEIVE_TIME_BYTES
     eight_byte_windows = np.lib.stride_tricks.sliding_window_view(content_bytes, RECEIVE_TIME_BYTES)

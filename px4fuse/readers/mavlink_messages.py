@@ -59,7 +59,11 @@ class PositionMessageType:
 
     @property
     def layout(self) -> MessageLayout:
-        """Fields of the message; those of ODOMETRY for its parts, such as ODOMETRY_VIO."""
+        """Fields of the message, and the DataFrame columns that they become.
+
+        Positions in ODOMETRY messages are split into several sources by estimator type, such as
+        ODOMETRY_VIO. All of them have the fields of ODOMETRY.
+        """
         return MESSAGE_LAYOUTS.get(self.track_name, MESSAGE_LAYOUTS["ODOMETRY"])
 
     @property

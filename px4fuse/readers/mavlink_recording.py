@@ -130,7 +130,10 @@ def fit_clock_line(x: Array, y: Array) -> ClockLine:
 
 
 def _fit_clock_rate(x: Array, y: Array, added_rate: float = 0.0) -> float:
-    """Return the Theil-Sen slope of y over x plus ``added_rate``; 1 if it is not plausible."""
+    """Return the rate of clock y relative to clock x; 1 if it is not plausible.
+
+    It is the Theil-Sen slope of y over x plus ``added_rate``, the rate that was subtracted from y.
+    """
     if len(x) < 2 or x[0] == x[-1]:
         return 1.0
     with np.errstate(over="ignore", invalid="ignore"):
@@ -200,9 +203,10 @@ class Recording:
         boot_times_s: Array | None = None,
         name: str = "",
     ) -> pd.DataFrame:
-        """Read one message as a DataFrame with strictly increasing flight times (s).
+        """Read one message as a DataFrame with strictly increasing times (s).
 
-        Euler angles are converted to quaternions, and vectors to NED (or FRD).
+        The times begin at the start of the flight, ``time_origin_s``. Euler angles are converted to
+        quaternions, and vectors to NED (or FRD).
 
         Parameters
         ----------
@@ -213,7 +217,7 @@ class Recording:
         boot_times_s : ndarray, shape (n,), optional
             Times since boot; by default the timestamps of the messages.
         name : str, optional
-            Name for the count of dropped samples; by default the message name.
+            Name under which dropped samples are counted; by default the message name.
         """
         rows = self.rows(layout.topic) if rows is None else rows
         table = self.frames.table(layout.topic, rows)
@@ -287,10 +291,10 @@ class Recording:
 
 
 def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
-    """Convert ODOMETRY samples to NED (or FRD); values in unsupported frames become NaN.
+    """Convert ODOMETRY samples to NED, or to FRD if the sender's axes are not tied to north.
 
-    PX4 up to v1.13 sends the velocity in the body frame, later releases in NED
-    (``streams/ODOMETRY.hpp``).
+    Values in unsupported frames become NaN. PX4 up to v1.13 sends the velocity in the body frame,
+    later releases in NED (``streams/ODOMETRY.hpp``).
     """
     quaternions = samples[Columns.QUATERNION].to_numpy(copy=True)
     has_quaternion = np.linalg.norm(quaternions, axis=1) > MIN_QUATERNION_NORM
@@ -410,8 +414,9 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
 def _find_restarts(boot_times_s: Array) -> IntArray:
     """Return the index of the first boot time after each restart of the autopilot.
 
-    A backward step due to a single late or early packet is not a restart: the boot time is also
-    smaller between RESTART_CHECK_MESSAGE_COUNT messages before and after the step.
+    A single late or early packet also causes a backward step of the boot time. At a restart, all
+    following boot times are smaller. The boot times RESTART_CHECK_MESSAGE_COUNT messages before and
+    after the step are therefore compared, too.
     """
     rows = np.flatnonzero(np.diff(boot_times_s) < -MIN_BACKWARD_STEP_AT_RESTART_S) + 1
     earlier_rows = np.maximum(rows - 1 - RESTART_CHECK_MESSAGE_COUNT, 0)

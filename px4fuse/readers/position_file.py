@@ -260,7 +260,10 @@ def _open_table(
 
 
 def _find_increasing_rows(times_s: Array) -> IntArray:
-    """Return the indices of the rows with strictly increasing times before 2100."""
+    """Return the longest series of rows with strictly increasing times, as row indices.
+
+    Rows with a time after the year 2100 are omitted.
+    """
     usable_rows = np.flatnonzero(np.abs(times_s) < MAX_VALID_UNIX_TIME_S)
     # Replace the times by their ranks: find_longest_increasing_subsequence needs positive integers
     time_ranks = np.unique(times_s[usable_rows], return_inverse=True)[1].astype(np.int64)
@@ -311,7 +314,8 @@ def _read_numbers(
 ) -> tuple[pd.DataFrame, list[ColumnMeaning], bool]:
     """Convert the text of the needed columns to numbers, and dates (ISO 8601) to UNIX times.
 
-    Return also the meanings with the unit of dates, and False for dates without time zone.
+    Return the numbers, the column meanings and True. For a column of dates, the returned meaning
+    has the unit s. The last value is False if the dates have no time zone.
     """
     known_columns = [index for index, meaning in enumerate(column_meanings) if meaning.kind]
     texts = table.read_cells([*quaternion_columns, *known_columns])

@@ -165,9 +165,10 @@ def _select_variance(topics: Topics, horizon_state: TableOrUnavailable) -> Table
 
 
 def _find_state_vector(topics: Topics) -> tuple[str, int]:
-    """Return the topic with EKF2's state vector, and the number of attitude variances.
+    """Return the topic with EKF2's state vector, and its number of attitude variances.
 
-    The topic is "" if it is not logged. The number is 0 for an unknown state vector.
+    The topic is "" if it is not logged. The number is 0 if no supported PX4 release logs arrays of
+    these lengths.
     """
     for topic in STATE_VECTOR_TOPICS:
         table = topics.first_table(topic)
@@ -400,14 +401,15 @@ def _read_fusion_record(
 
 
 def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
-    """Read the measured magnetic field (gauss, FRD) at the times of measurement, for the replay.
+    """Read the magnetic field (gauss, FRD) for the replay, at the times of measurement.
 
     The columns are the field, EKF2's innovations if logged, and fused_3d: 1 while EKF2 fuses the
     field as a vector. The table is empty if data are missing.
 
     The field is logged in vehicle_magnetometer and in estimator_aid_src_mag. The topic with more
-    samples is used. If it does not contain every fused sample, estimator_aid_src_mag is preferred:
-    its low-pass filtered innovations give the mean field between two logged samples.
+    samples is used if it contains every fused sample. Otherwise, estimator_aid_src_mag is used if
+    it contains innovations: they are low-pass filtered, so they give the mean field between two
+    logged samples.
     """
     magnetometer, observations = (
         topics.primary_samples(TOPIC_LAYOUTS[topic]).dropna()

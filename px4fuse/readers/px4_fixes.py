@@ -150,7 +150,8 @@ def reconstruct_fixes(
 def _estimate_receiver_interval(fix_times_s: Array) -> float | None:
     """Estimate the interval (s) between the fixes of a GNSS receiver, from some of its fixes.
 
-    All logged intervals are multiples of this interval. Return None if the multiples are unknown.
+    All logged intervals are multiples of this interval. Return None if no interval fits, or if a
+    longer interval would also fit.
     """
     logged_intervals_s = np.diff(fix_times_s)
     # Deviation of each logged interval (row) from a multiple of each candidate (column)

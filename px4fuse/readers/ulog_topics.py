@@ -528,7 +528,10 @@ def _read_tables(ulog: ULog) -> TopicTables:
 
 
 def _find_data_span_us(tables: TopicTables, name: str) -> tuple[int, int]:
-    """Return first and last time (µs) of the IMU data, or of the largest topic without IMU."""
+    """Return the first and last time (µs) of the IMU data.
+
+    If the log contains no IMU data, the topic with the most samples is used.
+    """
     for key in sorted(
         tables, key=lambda key: (key[0] != IMU_LAYOUT.topic, -len(tables[key]["timestamp"]))
     ):

@@ -1,1 +1,1 @@
-"""Report as PDF, and summary on the terminal."""
+"""Reports on flights, loop closures and trajectories as PDF, and summaries on the terminal."""

@@ -83,8 +83,8 @@ class Paragraph(NamedTuple):
     Attributes
     ----------
     wrap_indent : str or None
-        Indent of further lines and sentences; None if the paragraph is one line, such as a command.
-        With None, an empty text gives a blank line, otherwise no line.
+        Indent of further lines and sentences. None if the paragraph is always one line, such as a
+        command or a blank line.
     plot : str
         Plot on the right, omitted on a narrow terminal.
     """

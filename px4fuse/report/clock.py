@@ -39,7 +39,10 @@ TIME_OFFSET_FINDINGS = ("source_time_offset_changes", "source_time_offset", "ekf
 
 
 def summarise_offset(analysis: Analysis, findings: Iterable[Finding]) -> str:
-    """Summarise the time offset in one line; "" if the report has a page on the time offset."""
+    """Summarise the time offset of the position source in one line.
+
+    Return "" if the report has a page on the time offset.
+    """
     if has_time_offset_page(analysis, findings):
         return ""
     advice_by_label = make_time_offset_advice(
@@ -49,7 +52,10 @@ def summarise_offset(analysis: Analysis, findings: Iterable[Finding]) -> str:
 
 
 def has_time_offset_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
-    """Return True if the time offset is wrong, changes, or cannot be estimated."""
+    """Return True if the report needs a page on the time offset of the position source.
+
+    The page is drawn if the time offset is a fault (TIME_OFFSET_FINDINGS), or is not determinable.
+    """
     time_offset = analysis.time_offset
     if isinstance(time_offset, Unavailable):
         return False
@@ -63,9 +69,10 @@ def make_time_offset_advice(
     time_offset: SourceTimeOffset | Unavailable,
     rerun: Rerun | None = None,
 ) -> dict[str, str]:
-    """Return texts on the time offset of the position source, by label.
+    """Return sentences on the time offset of the source, by their label in the report.
 
-    ``rerun`` is a re-run of KF with the time offset.
+    The labels are "Result", "Offset", "Action" and "Re-run". ``rerun`` is a re-run of KF with the
+    time offset.
     """
     if isinstance(time_offset, Unavailable):
         reason, remedy = time_offset.reason, time_offset.remedy

@@ -104,7 +104,7 @@ def _describe_sigma_at_updates(result: AxisComparison) -> str:
 
 
 def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw position, velocity, innovations and σ along the other axes."""
+    """Draw position, velocity, innovations and σ along all axes but that of largest motion."""
     secondary_axes = analysis.select_secondary_axes()
     if not secondary_axes:
         return

@@ -182,7 +182,7 @@ def _write_closures(page: Page, loop: Loop) -> None:
 
 
 def _write_rpe(page: Page, loop: Loop) -> None:
-    """Write a table of the RPE of each path, for each reference."""
+    """Write a table of the RPE of the uncorrected and corrected paths, for each reference."""
     for reference in loop.references:
         page.write_heading(f"RPE against {reference.name}, with 95 % intervals")
         scores = [(path, path.scores[reference.name]) for path in loop.select_reported_paths()]

@@ -53,11 +53,12 @@ class FaultKind(Record):
     Attributes
     ----------
     quantity : str
-        Quantity of the size, for example "m"; "" for a fault without size.
+        Unit of the fault's size, such as "s", or a quantity with several allowed units; "" for a
+        fault without size.
     min_size, max_size : float
         Smallest and largest allowed size, in the first allowed unit.
     description : str
-        Name of the quantity that is the size.
+        Meaning of the size, such as "duration of a gap in the IMU data".
     """
 
     kind: str

@@ -90,7 +90,11 @@ class Ekf2Output:
     def find_logged_messages(
         self, is_message_event: BoolArray, end_step: IntArray, rate_hz: float
     ) -> IntArray:
-        """Return the indices of the messages that a logger writes with a rate limit (Hz)."""
+        """Return the fusion events whose messages a logger with a rate limit (Hz) writes.
+
+        The events are given by their indices. ``is_message_event`` is True for events with a
+        message. ``end_step`` contains the prediction step of each event.
+        """
         is_published = end_step < len(self.time_us) - self.lag_steps
         event_indices = np.flatnonzero(is_message_event & is_published)
         times_s = to_seconds(self.time_us[end_step[event_indices]])

@@ -159,7 +159,10 @@ def make_answer_key(simulation: Simulation) -> dict[str, Any]:
 
 
 def compute_true_values(simulation: Simulation) -> dict[str, float | list[float]]:
-    """Return the quantities of a simulated flight that its log does not contain."""
+    """Return the true values of a simulated flight, such as noises, biases and outlier times.
+
+    The log of the flight does not contain these values.
+    """
     scenario, faults = simulation.scenario, simulation.faults
     motion, source = simulation.motion, simulation.positions
     accelerometer_bias_m_s2, gyro_bias_rad_s = sensors.draw_imu_biases(scenario, faults)

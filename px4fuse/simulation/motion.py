@@ -61,9 +61,9 @@ def _sum_ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
 
 
 def _differentiate(ramp_function: PPoly, time_s: Array, orders: Sequence[int]) -> list[Array]:
-    """Return derivatives of a sum of ramps at given times, one array for each order.
+    """Return derivatives of a function of :func:`_sum_ramps`, one array for each order.
 
-    The arrays have the shape (times, components of the ramps). Order -1 is the integral.
+    The arrays have the shape (times, components of the function). Order -1 is the integral.
     """
     clipped_times_s = np.clip(time_s, *ramp_function.x[[0, -1]])
     return [ramp_function.derivative(order)(clipped_times_s) for order in orders]
@@ -89,7 +89,10 @@ class Sines:
         return cls(angular_frequency, amplitude * np.cos(phase), amplitude * np.sin(phase))
 
     def compute_values(self, time_s: Array, array_count: int = 1) -> list[Array]:
-        """Return the sum of the sines and its time derivatives: ``array_count`` arrays (t, k)."""
+        """Return the sum of the sines on each axis, then its time derivatives.
+
+        The result contains ``array_count`` arrays with the shape (times, axes).
+        """
         # Shapes for m sines: basis (t, 2m), with sin and cos of each angle; amplitudes (2m, k)
         angle = np.outer(time_s, self.angular_frequency_rad_s)
         basis = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)

@@ -103,7 +103,7 @@ class SimulatedPositions:
 
     @property
     def outlier_times_s(self) -> Array:
-        """Timestamps (s from the first sample) of the outliers."""
+        """Timestamps (s from the first sample) of the positions that are outliers."""
         return to_seconds(get_time_us(self.topic, "timestamp_sample")[self.is_outlier])
 
 

@@ -590,7 +590,11 @@ def _move_to_reference_body(
 def _rotate_to_reference_body(
     aligned_estimate: Trajectory, reference: Trajectory
 ) -> tuple[Trajectory, tuple[str, ...]]:
-    """Remove the constant rotation between camera and vehicle axes, and return a note."""
+    """Rotate the body axes of the estimate to those of the reference, if one has camera axes.
+
+    The constant rotation between camera and vehicle axes is estimated. Return also a note on this
+    rotation for the user, or no note.
+    """
     # Body axes are camera axes in a camera frame, and probably also for SLAM in an unknown frame.
     # They differ between such a trajectory and a trajectory in another frame
     body_axes_differ = aligned_estimate.frame != reference.frame and any(

@@ -110,7 +110,8 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
 def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOffset:
     """Estimate the time offset to add to the timestamps of the trajectory with fewer poses.
 
-    If several offsets fit, the UNIX times decide; without them, the offset is not determinable.
+    If several time offsets fit, the one nearest to the difference of the UNIX times is used.
+    Without UNIX times, the time offset is then not determinable.
     """
     clock_offset_s = compute_clock_offset_s(sparse_track, dense_track)
     candidate_offsets_s = _find_candidate_offsets_s(sparse_track, dense_track)
@@ -291,7 +292,7 @@ class _OffsetFit:
     dense_track_position_m: Array
 
     def compute_residual_rms_m(self) -> float:
-        """Return the RMS position residual (m)."""
+        """Return the RMS distance (m) between the compared poses of both trajectories."""
         return compute_rms_length_m(self.dense_track_position_m - self.aligned_position_m)
 
     def compute_misfit(self) -> float:

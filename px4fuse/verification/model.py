@@ -90,6 +90,9 @@ class Verification:
 
     @property
     def outcome(self) -> str:
-        """Result for users: ``status``, or "page differs" if only pages of the PDF were changed."""
+        """Result of the verification for users.
+
+        It is ``status``, or "page differs" if the numbers are verified but pages of the PDF differ.
+        """
         has_different_pages = self.status == "verified" and self.page_status == "differ"
         return "page differs" if has_different_pages else self.status

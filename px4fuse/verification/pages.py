@@ -235,7 +235,8 @@ class _PdfComparison:
     ) -> Iterator[_PdfDifference]:
         """Yield the differences in keys and streams of two PDF dictionaries.
 
-        Add the pairs of their values to ``pairs_to_compare`` or ``deferred_pairs``.
+        The values of their common keys are not compared here. The pairs of values are added to
+        ``pairs_to_compare``, or to ``deferred_pairs``, which is compared after all pages.
         """
         submitted_keys = _select_compared_keys(submitted_dictionary, key)
         redrawn_keys = _select_compared_keys(redrawn_dictionary, key)

@@ -98,9 +98,9 @@ def log_sha256(results: ReportedResults) -> str:
 def recompute_report(
     results: ReportedResults, path_by_sha256: Mapping[str, Path]
 ) -> RecomputedReport | Verification:
-    """Repeat the analysis of a report with the settings in ``results``.
+    """Repeat the analysis of a submitted report with the settings in its ``results``.
 
-    Return the status "cannot verify" if the analysis fails.
+    Return a verification with the status "cannot verify" if the analysis fails.
     """
     try:
         if tuple(results.provenance.libraries) != LIBRARIES:
@@ -342,10 +342,11 @@ def _compare_with_new_report(
 def is_same_number_up_to_rounding(
     agreeing_pairs: Iterable[tuple[float, float]], submitted_number: str, redrawn_number: str
 ) -> bool:
-    """Return True if two printed numbers are the rounded values of the same result.
+    """Return True if two printed numbers can be rounded values of the same result.
 
-    ``agreeing_pairs`` contains results that agree within the tolerances: each is a pair of the
-    value in the report and the value in the new analysis.
+    ``agreeing_pairs`` contains results that agree within the tolerances: the value in the submitted
+    report, and the value in the new analysis. The printed numbers must be the rounded values of one
+    of these pairs.
     """
     decimals = _count_decimals(submitted_number)
     printed_pair = float(submitted_number), float(redrawn_number)

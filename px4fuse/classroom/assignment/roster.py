@@ -271,7 +271,10 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
 
 
 class ClassList:
-    """Students of a class; missing fields are copied from ``other_lists``."""
+    """Students of a class, who can be found by name, id, login or email.
+
+    Empty fields of a student are filled from ``other_lists``, such as grade sheets.
+    """
 
     def __init__(self, people: Iterable[Person] = (), *other_lists: Iterable[Person]) -> None:
         self.people = list(people)

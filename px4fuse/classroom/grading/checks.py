@@ -70,7 +70,10 @@ class RubricItem(Record, kw_only=True, tag_field="check"):
         raise NotImplementedError
 
     def is_applicable(self, command_name: str, key: AnswerKey | None) -> bool:
-        """Return True if the item can score reports of a px4fuse command."""
+        """Return True if this rubric item can score the reports of a px4fuse command.
+
+        An item with ``needs_answer_key`` can score reports only if ``key`` is given.
+        """
         has_required_key = key is not None or not self.needs_answer_key
         return has_required_key and {self.report, self.command} <= {"any", command_name}
 
@@ -243,7 +246,10 @@ class NumberItem(RubricItem, tag="number"):
             )
 
     def _compute_excess(self, number: float) -> float:
-        """Return the distance from the nearer bound to the number; negative within the bounds."""
+        """Return the distance of a number from the nearer bound of this item.
+
+        It is negative within the bounds.
+        """
         return max(self.at_least - number, number - self.at_most)
 
     def _score_number(self, number: float) -> float:

@@ -73,7 +73,11 @@ def format_class_page(grades: Sequence[Grade], title: str, version_text: str) ->
 
 
 def _format_statistics(grades: Sequence[Grade], count_by_tag: Mapping[str, int]) -> str:
-    """Format the statistics of the class: reports by status, and points of students and items."""
+    """Format the summary above the table of students: reports by status, and points.
+
+    ``count_by_tag`` contains the number of students with each tag, such as "verified". The points
+    of each rubric item are shown, too.
+    """
     totals = [grade.total for grade in grades if grade.total is not None]
     reports = select_counted_reports(grades)
     pending_points = [report.points for report in reports if report.instructor_action]

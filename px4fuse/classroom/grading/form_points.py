@@ -61,16 +61,16 @@ MAX_RELATIVE_SIZE_ERROR_FOR_HALF_POINTS = 0.4
 
 
 class CorrectionRule(Record):
-    """Answer of a student that gives points as correction of a fault (row of ``corrections.csv``).
+    """Rule for the points of a correction that a student names (row of ``corrections.csv``).
 
-    For each fault, the first row is the best correction.
+    The first row of a fault contains its best correction.
 
     Attributes
     ----------
     parameter : str
         Changed option, EKF2 parameter, or other action.
     fault_kinds : str
-        Faults, separated by blanks.
+        Faults for which this correction gives points, separated by blanks.
     score : float
         Fraction of the points: 1 if the parameter corrects the fault, 1/2 if it concerns the fault
         but does not correct it, and 1/3 if it only hides the fault.
@@ -242,9 +242,9 @@ def _format_answer(answer: object) -> str:
 def _match_faults(
     answers: Answers, right_answers: CorrectFormAnswers
 ) -> tuple[list[FaultMatch], list[NamedFault]]:
-    """Match each injected fault with the named fault that gives the most points.
+    """Match each injected fault with the fault in a student's answers that gives most points.
 
-    Return the matches, and the named faults that match no injected fault.
+    Return the matches, and the faults in the answers that match no injected fault.
     """
     unmatched_faults = [
         named_fault for named_fault in answers.mistakes if named_fault.kind != NO_FAULT_KIND

@@ -310,7 +310,11 @@ def repeat_analysis_with_diagnosis(
 def _collect_versions_and_files(
     results: str, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
 ) -> dict[str, str]:
-    """Return the versions of libraries, and the availability of input files by SHA-256."""
+    """Return library versions and input files, on which a stored verification depends.
+
+    Keys are library names, and SHA-256 hashes of the input files. A file is "available" in the
+    given files, "assigned" (not given, but assigned to a student) or "missing".
+    """
     versions = provenance("")
     versions_and_files = {**versions.libraries, "px4fuse": versions.px4fuse}
     for sha256 in find_file_hashes(results):

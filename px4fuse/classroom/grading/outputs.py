@@ -303,7 +303,10 @@ def _format_csv(titles: Sequence[str], rows: Iterable[Sequence[str | float | Non
 
 
 def feedback_text(grade: Grade, class_name: str = "") -> str:
-    """Format points, comments and reasons for one student as text, without flags."""
+    """Format points, comments and reasons for one student as text.
+
+    Flags are omitted, because they are for the instructor.
+    """
     report = grade.counted_report
     is_total_set_by_instructor = TOTAL_TITLE in grade.overrides
     lines = [class_name] if class_name else []

@@ -229,7 +229,11 @@ def _flag_report(scoring_input: ScoringInput) -> Iterator[str]:
 def _find_problems(
     scoring_input: ScoringInput, rubric: Rubric
 ) -> Iterator[tuple[ReportPointsRule, str, str]]:
-    """Yield rule, reason for the student and action of the instructor for each problem."""
+    """Yield the problems of a student's report that affect its points.
+
+    A problem consists of the rule for the points, the reason for the student and the action of the
+    instructor.
+    """
     verification = scoring_input.verification
     reason_text = format_reason("".join(verification.reasons[:1]))
     if verification.status == "numbers differ":

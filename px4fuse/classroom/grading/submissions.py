@@ -213,7 +213,11 @@ def _is_gradescope_metadata(name: str) -> bool:
 
 
 class _BlockLimitedFile:
-    """Zip file that can be read only in blocks of at most MAX_DIRECTORY_BYTES."""
+    """Zip file with a limit on the size of one read, MAX_DIRECTORY_BYTES.
+
+    zipfile reads the central directory (list of entries) at once into memory. The limit rejects a
+    zip file with a huge central directory.
+    """
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
@@ -383,7 +387,11 @@ def parse_submission_path(
 
 
 def _match_platforms(name: str, platforms: Iterable[str]) -> Iterator[tuple[str, re.Match[str]]]:
-    """Yield platforms with matches of their patterns, from the beginning of a path to its end."""
+    """Yield the learning platforms whose path pattern matches, with the match.
+
+    The patterns are tested from the first folder of the path, then from the second one, and so on,
+    and last from the file name.
+    """
     while name:
         for platform in platforms:
             if match := PATH_PATTERN_BY_PLATFORM[platform].match(name):

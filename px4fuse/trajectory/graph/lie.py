@@ -223,7 +223,10 @@ def _left_jacobian_inverse(phi: Array) -> Array:
 
 
 def _compute_square_term_factor(theta: Array) -> Array:
-    """Return f(theta) = (1 - theta/2 cot(theta/2)) / theta^2."""
+    """Return the factor of the square term [phi]×² in the inverse left Jacobian of SO(3).
+
+    The factor is f(theta) = (1 - theta/2 cot(theta/2)) / theta^2, with the angle theta = |phi|.
+    """
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
     closed_form_value = (1.0 - 0.5 * t / np.tan(0.5 * t)) / t**2
     return np.where(
@@ -234,7 +237,10 @@ def _compute_square_term_factor(theta: Array) -> Array:
 
 
 def _compute_square_term_derivative_over_theta(theta: Array) -> Array:
-    """Return f'(theta) / theta, for f(theta) = (1 - theta/2 cot(theta/2)) / theta^2."""
+    """Return f'(theta) / theta for the factor f of :func:`_compute_square_term_factor`.
+
+    The derivative of the inverse left Jacobian contains this term.
+    """
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
     half_cot_derivative = 0.5 / np.tan(0.5 * t) - 0.25 * t / np.sin(0.5 * t) ** 2
     closed_form_value = -(half_cot_derivative + 2.0 * (1.0 - 0.5 * t / np.tan(0.5 * t)) / t) / t**3

@@ -66,7 +66,7 @@ class NormalEquations:
         block_columns, block_rows = np.divmod(blocks, len(position))
 
         def enumerate_numbers(indices: IntArray, count: int) -> IntArray:
-            """Return the indices of the ``count`` numbers of each pose or matrix block."""
+            """Return the element indices of poses or blocks with ``count`` elements each."""
             return np.asarray((indices[:, None] * count + np.arange(count)).ravel())
 
         self._edges = edges
@@ -135,9 +135,10 @@ class NormalEquations:
     def solve(
         self, matrix_blocks: Array, right_hand_sides: Array, damping: float = 0.0
     ) -> Array | None:
-        """Solve the equations, with damping added to the diagonal.
+        """Solve the normal equations of :meth:`assemble`.
 
-        Return None if the matrix is not positive definite.
+        ``damping`` (Levenberg-Marquardt) is added to the diagonal. Return None if the matrix is not
+        positive definite.
         """
         _, unknowns_per_pose, right_hand_side_count = right_hand_sides.shape
         matrix_blocks = matrix_blocks.copy()
@@ -197,7 +198,7 @@ class NormalEquations:
 def _find_elimination_order(
     edges: IntArray, max_poses_per_leaf_group: int
 ) -> tuple[IntArray, IntArray, list[IntArray]]:
-    """Return the order of elimination of n poses in g frontal matrices.
+    """Return the order in which n poses are eliminated, in g frontal matrices (fronts).
 
     Returns
     -------
@@ -206,7 +207,8 @@ def _find_elimination_order(
     eliminated_counts : ndarray of int, shape (g,)
         Number of poses that are eliminated in each front.
     poses_by_front : list of ndarray of int
-        Ascending positions of the poses in each front: those that it eliminates, then others.
+        Poses of each front, as indices in the order of elimination: first the eliminated poses,
+        then the remaining poses. Both parts are in ascending order.
     """
     # Poses are numbered by their index in the sparse order. remaining_poses: see
     # _build_elimination_tree
@@ -252,11 +254,12 @@ def _find_sparse_order(edges: IntArray) -> IntArray:
 
 
 def _build_elimination_tree(edges: IntArray) -> tuple[list[set[int]], list[int]]:
-    """Return the remaining poses of each pose, and the size of its subtree.
+    """Return the remaining poses of each pose in the elimination tree, and its subtree size.
 
-    The remaining poses of a pose are the nonzero rows below the diagonal in its column of the
-    Cholesky factor: its later neighbours, and the remaining poses of its children. The first of
-    them is its parent. The last pose has no parent.
+    Pose k is eliminated in step k. Its remaining poses are the nonzero rows below the diagonal in
+    column k of the Cholesky factor: later poses that are connected to it by an edge or by the
+    elimination of its children. The parent of a pose is the first of its remaining poses. The last
+    pose has no parent.
     """
     remaining_poses: list[set[int]] = [set() for _ in range(int(edges.max()) + 1)]
     for first, second in np.sort(edges, axis=0).T.tolist():
