@@ -450,8 +450,8 @@ def _evaluate_hypothesis(
     """Compute the score of a hypothesis on the source's axes, and the next Gauss-Newton step.
 
     The score is the log likelihood of the source's second differences, given those from the IMU.
-    The step is added to the parameters of the hypothesis. Return None if source and IMU have too few
-    common samples, or no motion.
+    The step is added to the parameters of the hypothesis. Return None if source and IMU have too
+    few common samples, or no motion.
     """
     delay_s, rotation_rad, heading_drift_rad_s, clock_drift, *accelerometer_bias_m_s2 = (
         hypothesis.parameters
