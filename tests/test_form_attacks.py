@@ -110,7 +110,7 @@ ATTACKS: dict[str, tuple[str, str | float]] = {
     "N15 Cyrillic letter": (changed('"clock-', '"\u0441lock-'), "is not one of"),
     "N15 zero-width space": (changed('"clock-', '"clock\u200b-'), "is not one of"),
     "N15 capital letters": (changed('"clock-offset', '"CLOCK-OFFSET'), "is not one of"),
-    "N16 misspelt table": (HONEST.replace("[[mistake]]", "[[mistakes]]"), "unknown"),
+    "N16 misspelt table": (HONEST.replace("[[mistake]]", "[[mistakes]]"), "no field mistakes"),
     "N16 points": ("points = 100\n" + HONEST, "unknown field `points`"),
     "N17 times outside flight": (changed("50.5\nuntil_s = 53", "-5\nuntil_s = 1e8"), 97.5),
     "N17 end before start": (changed("until_s = 53", "until_s = 40"), 97.5),

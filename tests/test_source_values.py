@@ -309,7 +309,7 @@ def test_wrong_timestamp_unit_report_shows_ekf2_never_fused():
     first, second = detected(with_clock(flight, "milliseconds"))
     assert "in milliseconds" in first.message
     assert "EKF2 never fused the positions" in first.message
-    assert "the timestamps are in milliseconds" in second.title
+    assert "timestamps are in milliseconds" in second.title
 
 
 def test_report_on_repeated_timestamps_states_clock_resolution():
