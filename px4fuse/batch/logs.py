@@ -63,21 +63,8 @@ def _find_logs_matching_pattern(pattern: str) -> list[LogAddress]:
     if not pattern:
         raise SettingsError("the name of a log is empty", "Give files, folders, globs or URLs.")
     file_system, root_path = _open_file_system(pattern)
-    is_local = _is_local(file_system)
     try:
-        if file_system.exists(root_path) and not file_system.isdir(root_path):
-            # also a device or pipe, which a worker process rejects with a message
-            is_file = file_system.isfile(root_path)
-            size_by_path = {root_path: file_system.size(root_path) if is_file else None}
-        else:
-            is_folder = file_system.isdir(root_path)
-            list_files = file_system.find if is_folder else file_system.glob
-            size_by_path = {
-                path: file_info.get("size")
-                for path, file_info in list_files(root_path, detail=True).items()
-                if file_info.get("type", "file") == "file"
-                and (not is_folder or path.lower().endswith(LOG_SUFFIXES))
-            }
+        size_by_path = _find_file_sizes(file_system, root_path)
     # fsspec raises exceptions of many types, for example for an unknown account
     except Exception as error:
         raise SettingsError(
@@ -91,13 +78,30 @@ def _find_logs_matching_pattern(pattern: str) -> list[LogAddress]:
         )
     found_logs = []
     for path, size_bytes in size_by_path.items():
-        address = path if is_local else file_system.unstrip_protocol(path)
-        is_relative_path = is_local and not Path(pattern).is_absolute()
-        path_for_table = os.path.relpath(path) if is_relative_path else address
-        found_logs.append(LogAddress(_file_name(path), path_for_table, address, size_bytes))
-        if is_local:
+        address = path_for_table = path
+        if not _is_local(file_system):
+            address = path_for_table = file_system.unstrip_protocol(path)
+        else:
             register_input_path(Path(path))
+            if not Path(pattern).is_absolute():
+                path_for_table = os.path.relpath(path)
+        found_logs.append(LogAddress(_file_name(path), path_for_table, address, size_bytes))
     return found_logs
+
+
+def _find_file_sizes(file_system: AbstractFileSystem, path: str) -> dict[str, int | None]:
+    """Return the size of each log in a folder, of each file that matches a glob, or of a file."""
+    if file_system.isdir(path):
+        files = file_system.find(path, detail=True)
+        files = {name: files[name] for name in files if name.lower().endswith(LOG_SUFFIXES)}
+    elif file_system.exists(path):
+        # also a device or pipe, which a worker process rejects with a message
+        return {path: file_system.size(path) if file_system.isfile(path) else None}
+    else:
+        files = file_system.glob(path, detail=True)
+    return {
+        name: info.get("size") for name, info in files.items() if info.get("type", "file") == "file"
+    }
 
 
 @contextmanager

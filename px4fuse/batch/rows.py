@@ -126,12 +126,14 @@ def find_first_action(card: DiagnosisCard) -> str:
     if not card.causes:
         return ""
     first_cause = card.causes[0]
-    for action in (
-        *(first_cause.alternatives[0] if first_cause.alternatives else ()),
-        *first_cause.actions,
-    ):
+    # the user takes one group of alternatives, and then the further actions
+    actions = first_cause.actions
+    if first_cause.alternatives:
+        actions = first_cause.alternatives[0] + actions
+    for action in actions:
         if action.commands:
             return "\n".join(action.commands)
+        # a change without commands comes first, for example of a sensor: give its text
         if action.changes_something():
             break
     return card.do_this[0] if card.do_this else ""
