@@ -173,6 +173,7 @@ class _PdfComparison:
             self.fonts = resolve_reference(redrawn_page.get_object()["/Resources"].get("/Font", {}))
             for difference in self._compare((submitted_page, redrawn_page, "/Page")):
                 yield PageDifference(page_number, *difference)
+        # the comparison of pages and of these pairs may append further pairs
         for pair in self.deferred_pairs:
             for difference in self._compare(pair):
                 yield PageDifference(0, *difference)
@@ -182,25 +183,19 @@ class _PdfComparison:
 
     def _compare(self, pair: _ValuePair) -> Iterator[_PdfDifference]:
         """Yield the differences of two PDF values, including nested values."""
+        # a stack instead of recursion: lists and dictionaries add the pairs of their elements, the
+        # last element first, and the loop compares the newest pair
         self.pairs_to_compare = [pair]
         while self.pairs_to_compare:
             submitted_value, redrawn_value, key = self.pairs_to_compare.pop()
             self.value_count += 1
             if self.value_count > MAX_PDF_VALUES:
                 raise LimitReachedError(f"the PDF contains more than {MAX_PDF_VALUES} values")
-            if isinstance(submitted_value, IndirectObject):
-                if submitted_value.generation:
-                    # programs that ignore generation numbers would display another object
-                    yield f"another program changed the PDF entry {key}", _STRUCTURAL
-                if isinstance(redrawn_value, IndirectObject):
-                    object_ids = (
-                        submitted_value.idnum,
-                        submitted_value.generation,
-                        redrawn_value.idnum,
-                    )
-                    if object_ids in self.compared_objects:
-                        continue
-                    self.compared_objects.add(object_ids)
+            if isinstance(submitted_value, IndirectObject) and submitted_value.generation:
+                # programs that ignore generation numbers would display another object
+                yield f"another program changed the PDF entry {key}", _STRUCTURAL
+            if self._is_compared_before(submitted_value, redrawn_value):
+                continue
             submitted_value = resolve_reference(submitted_value)
             redrawn_value = resolve_reference(redrawn_value)
             if _pdf_type_of(submitted_value) is not _pdf_type_of(redrawn_value):
@@ -217,7 +212,6 @@ class _PdfComparison:
                     continue
                 # list.__iter__ does not resolve the references
                 elements = zip(*map(list.__iter__, (submitted_value, redrawn_value)), strict=True)
-                # the last pair of the list is compared first
                 self.pairs_to_compare += reversed([(*pair, key) for pair in elements])
             elif not self._is_same_value(submitted_value, redrawn_value):
                 submitted_text = shorten_to_line(str(submitted_value), 60)
@@ -227,6 +221,20 @@ class _PdfComparison:
                     f"{redrawn_text!r}",
                     _CONTENT,
                 )
+
+    def _is_compared_before(self, submitted_value: Any, redrawn_value: Any) -> bool:
+        """Return True for references to compared objects, otherwise register the references.
+
+        PDF objects may refer to each other in a cycle, for example a page and its annotation.
+        """
+        if not isinstance(submitted_value, IndirectObject) or not isinstance(
+            redrawn_value, IndirectObject
+        ):
+            return False
+        object_ids = submitted_value.idnum, submitted_value.generation, redrawn_value.idnum
+        is_compared = object_ids in self.compared_objects
+        self.compared_objects.add(object_ids)
+        return is_compared
 
     def _compare_dictionaries(
         self, submitted_dictionary: Any, redrawn_dictionary: DictionaryObject, key: str
@@ -246,7 +254,6 @@ class _PdfComparison:
                 )
             else:
                 yield f"the PDF lacks an entry {shorten_to_line(name, 40)}", _STRUCTURAL
-        # the last pair of the list is compared first
         for name in sorted(submitted_keys & redrawn_keys, reverse=True):
             # /Parent of a page refers to all other pages, so it is compared after all pages
             (self.deferred_pairs if name == "/Parent" else self.pairs_to_compare).append(
@@ -304,10 +311,9 @@ class _PdfComparison:
         for number, (submitted, redrawn) in enumerate(
             zip_longest(*operation_lists, fillvalue=("", ())), start=1
         ):
-            (submitted_operator, submitted_operands), (redrawn_operator, redrawn_operands) = (
-                submitted,
-                redrawn,
-            )
+            submitted_operator, submitted_operands = submitted
+            redrawn_operator, redrawn_operands = redrawn
+            # Tf selects the font of the next texts
             if redrawn_operator == "Tf":
                 font_name = str(redrawn_operands[0])
             if _is_same_operation(submitted, redrawn):
@@ -317,8 +323,10 @@ class _PdfComparison:
                 return f"PDF drawing operation {number} ({operator_text}) was changed"
             submitted_text = self._decode_text(submitted_operands, font_name)
             redrawn_text = self._decode_text(redrawn_operands, font_name)
+            # numbers between the parts of a text move the next part
             kerning = [abs(value) for value in submitted_operands if isinstance(value, float)]
-            # if the texts are equal, only the kerning was changed
+            # tolerate only a text with another last digit of a number. If the texts are equal, the
+            # operations differ in the kerning
             if (
                 submitted_text == redrawn_text
                 or max(kerning, default=0.0) >= MAX_KERNING_PER_MILLE_EM
@@ -350,12 +358,15 @@ def _find_ambiguities(pdf: bytes) -> Iterator[PageDifference]:
     """Yield each file structure that PDF programs may interpret differently."""
     end_match = _END_OF_FILE_PATTERN.search(pdf[-1024:])
     if end_match is None:
-        yield PageDifference(0, "the file has bytes after the end of the PDF", True)
+        yield PageDifference(0, "the file has bytes after the end of the PDF", _STRUCTURAL)
     elif b"/Linearized" in pdf[:1024]:
-        # a second cross-reference table could replace pages
-        xref_table_start = pdf.find(b"endobj") + len(b"endobj")
-        if pdf[xref_table_start : int(end_match[1])].strip():
-            yield PageDifference(0, SECOND_XREF_TABLE_REASON, True)
+        # in a linearised PDF (ISO 32000-1, annex F), the cross-reference table follows the first
+        # object, and the end of the file states its position ("startxref"). If both positions
+        # differ, there are two tables, and the second could replace pages
+        first_object_end = pdf.find(b"endobj") + len(b"endobj")
+        stated_xref_table_start = int(end_match[1])
+        if pdf[first_object_end:stated_xref_table_start].strip():
+            yield PageDifference(0, SECOND_XREF_TABLE_REASON, _STRUCTURAL)
 
 
 def _get_page_references(reader: pypdf.PdfReader) -> list[Any]:
