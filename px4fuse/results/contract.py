@@ -120,10 +120,6 @@ class ChosenSettings(Record, kw_only=True):
     clock_offset_s: float
 
 
-# Field of AxisTuning that contains the maximum-likelihood estimate of a KF setting
-ESTIMATE_FIELD_BY_SETTING = {"sigma_a_m_s2": "sigma_a_two_state_m_s2", "sigma_z_m": "sigma_z_m"}
-
-
 DiffInputName = Literal["A", "B"]
 # 95 % interval; the upper bound is None if the data do not limit it
 ConfidenceInterval = tuple[float, float | None]

@@ -104,26 +104,29 @@ def draw_figures(draw_number: Callable[[str], float]) -> bytes:
 
     ``draw_number`` is as in :func:`make_choice_questions`.
     """
-    comparisons = {}
-    for title, kind in _select_fault_kinds(draw_number).items():
+    return _plot_figures(
+        {
+            title: _simulate_flight(title, kind, draw_number)
+            for title, kind in _select_fault_kinds(draw_number).items()
+        }
+    )
 
-        def draw_random_number_for_figure(number_name: str, title: str = title) -> float:
-            return draw_number(f"{title} {number_name}")
 
-        random_scenario_parameters = draw_scenario_numbers("aisle", draw_random_number_for_figure)
-        scenario = make_scenario(
-            "aisle",
-            passes=STRAIGHT_PASS_COUNT,
-            seed=int(2**53 * draw_random_number_for_figure("seed")),
-            **random_scenario_parameters,
-        )
-        comparisons[title] = compare_simulation(
-            flights.simulate(
-                scenario,
-                parse_faults(FIGURE_ANSWERS_BY_FAULT[kind].mistake_option.split()),
-            )
-        )
-    return _plot_figures(comparisons)
+def _simulate_flight(title: str, kind: str, draw_number: Callable[[str], float]) -> Comparison:
+    """Simulate and analyse the flight of a figure, with the injected fault ``kind``."""
+
+    def draw_number_of_figure(name: str) -> float:
+        return draw_number(f"{title} {name}")
+
+    scenario = make_scenario(
+        "aisle",
+        passes=STRAIGHT_PASS_COUNT,
+        # an integer: the random numbers are multiples of 2**-53
+        seed=int(2**53 * draw_number_of_figure("seed")),
+        **draw_scenario_numbers("aisle", draw_number_of_figure),
+    )
+    faults = parse_faults(FIGURE_ANSWERS_BY_FAULT[kind].mistake_option.split())
+    return compare_simulation(flights.simulate(scenario, faults))
 
 
 def _plot_figures(comparisons: Mapping[str, Comparison]) -> bytes:

@@ -266,7 +266,8 @@ def _make_injected_fault(
         tolerance = CLOSURE_ERROR_TOLERANCE_M
     low, high = size - tolerance, size + tolerance
     if name == "clock-offset":
-        # also accept the estimate of px4fuse, a correction with the opposite sign of the fault
+        # also accept the estimate of px4fuse. It is a correction, so the fault has the opposite
+        # sign: a correction of 0.1 to 0.2 s is for an offset of -0.2 to -0.1 s
         _, time_offset = estimate_noises_and_time_offset(comparison)
         if isinstance(time_offset, SourceTimeOffset) and time_offset.is_determinable:
             lowest_correction_s, highest_correction_s = time_offset.interval_s
@@ -285,12 +286,13 @@ def _find_fault_time(
     outlier_times_s = simulation.positions.outlier_times_s.tolist()
     if name == "nlos" and outlier_times_s:
         return outlier_times_s[0], outlier_times_s[-1]
+    # fields of FaultSizes that end in _at_s are start times
     last_field_name = FAULT_TYPES[name].value_field_names[-1]
     if not last_field_name.endswith("_at_s"):
         return None, None
     start_s = getattr(simulation.faults, last_field_name)
     # the size of a dropout is its duration; other faults last until the end
-    return start_s, start_s + size if name.endswith("dropout") else None
+    return start_s, start_s + size if name in ("dropout", "imu-dropout") else None
 
 
 def _determine_right_verdict(comparison: Comparison, filter_name: FilterName) -> CorrectVerdict:

@@ -187,14 +187,18 @@ def assign_random_flight(
         # index of the first cumulative probability that is larger than the random number
         *cumulative_probabilities, _ = accumulate(PROBABILITY_BY_FAULT_COUNT[kind])
         fault_count = bisect(cumulative_probabilities, draw_number("count"))
+    # try the faults in random order; omit a fault that masks a selected fault, or is masked by it
     faults: list[AssignableFault] = []
     possible_faults = (fault for fault in ASSIGNABLE_FAULTS if fault.flight_kind == kind)
     for fault in sorted(possible_faults, key=lambda each: draw_number(f"order {each.name}")):
         if len(faults) < fault_count and all(map(fault.is_detectable_with, faults)):
             faults.append(fault)
+    # difficulty: smallest size that px4fuse detects ÷ injected size. Above 1, a fault is smaller
+    # than that, and px4fuse may not detect it
     low, high = EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
     if draw_number("undetectable") < DIFFICULT_FAULTS_PROBABILITY:
         low, high = HARDEST_DIFFICULTY, MAX_FAULT_DIFFICULTY
+    # a fault without size is easy
     difficulties = [
         low + (high - low) * draw_number(f"size {fault.name}")
         if fault.detection_limit
@@ -211,9 +215,8 @@ def assign_random_flight(
         seed=derive_random_bits(secret, student_id, kind, "seed"),
         **draw_scenario_numbers(kind, draw_number),
     )
-    return AssignedFlight(
-        scenario, mistake_options, round(max(difficulties, default=HARDEST_DIFFICULTY), 2)
-    )
+    hardest_difficulty = max(difficulties, default=1.0)
+    return AssignedFlight(scenario, mistake_options, round(hardest_difficulty, 2))
 
 
 def draw_scenario_numbers(

@@ -28,6 +28,7 @@ from ..assignment.roster import (
     ClassList,
     Sheet,
     format_cell_number,
+    format_csv,
     make_file_names,
     make_unique,
     normalise_text,
@@ -287,14 +288,14 @@ def format_class_table(grades: Sequence[Grade]) -> str:
 
 def _format_csv(titles: Sequence[str], rows: Iterable[Sequence[str | float | None]]) -> str:
     cell_rows = (
-        tuple(
+        [
             neutralise_formulas(value) if isinstance(value, str) else format_cell_number(value)
             for value in row
-        )
+        ]
         for row in (titles, *rows)
     )
     # Excel detects UTF-8 by the byte order mark
-    return "\ufeff" + Sheet(Path(), next(cell_rows), tuple(cell_rows)).text
+    return "\ufeff" + format_csv(cell_rows)
 
 
 # ------------------------------------------------------------------ feedback
