@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import datetime, tzinfo
+from datetime import date, datetime, tzinfo
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -231,24 +231,21 @@ def _collect_students(
     """Make a class list of the students that learning platforms and reports name."""
     class_list = ClassList()
     for report, submission in zip(reports, submissions, strict=True):
-        person = submission.origin.person
-        reported_student_index = class_list.find_student_index(Person(report.student_id))
+        person, new_id = submission.origin.person, report.student_id
+        if class_list.find_student_index(Person(new_id)) is not None:
+            new_id = ""  # the id in the report is that of a listed student
         if person.numbers or person.login:  # the learning platform identifies the student
             if class_list.find_student_index(person) is not None:
                 continue
-            student_id, name = person.student_id, person.name
-            if not student_id and reported_student_index is None:
-                student_id = report.student_id
+            student_id, name = person.student_id or new_id, person.name
             if student_id:
                 name = report.student.strip() or name
             else:  # do not use the report: it has no id, or that of another student
                 student_id = person.login or " ".join(person.numbers.values())
             person = replace(person, student_id=student_id, name=shorten_to_line(name, 200))
             class_list.people.append(person)
-        elif report.student_id and reported_student_index is None:
-            class_list.people.append(
-                Person(report.student_id, shorten_to_line(report.student, 200))
-            )
+        elif new_id:  # only the report identifies the student
+            class_list.people.append(Person(new_id, shorten_to_line(report.student, 200)))
     return class_list
 
 
@@ -337,18 +334,16 @@ def _choose_counted_report(candidates: Sequence[_CandidateReport], course: Cours
 
     def rank(candidate: _CandidateReport) -> tuple[float, float, str]:
         points = max(candidate.report.points - candidate.grade.deducted_points, 0.0)
-        time_s = candidate.time_s
-        criteria = {
-            "latest": (time_s, points),
-            "first": (-time_s, points),
-            "best": (points, time_s),
-        }
         # the name decides between reports with equal time and points
-        return (*criteria[course.attempt], candidate.report.submission)
+        time_s, name = candidate.time_s, candidate.report.submission
+        if course.attempt == "best":
+            return points, time_s, name
+        return (-time_s if course.attempt == "first" else time_s), points, name
 
     chosen = max(eligible_candidates, key=rank)
     report, flags = chosen.report, list(chosen.grade.flags)
-    # without this rule, students could hand in several answer forms with different guesses
+    # students could hand in several answer forms with different guesses. If the best report counts,
+    # flag different forms; otherwise only the forms of the same time compete
     if course.attempt == "best":
         if len({each.report.form for each in readable}) > 1:
             flags.append(
@@ -364,9 +359,9 @@ def _choose_counted_report(candidates: Sequence[_CandidateReport], course: Cours
             report = replace(report, instructor_action=action)
     others = [each for each in candidates if each is not chosen]
     for other in others:
-        is_report = bool(other.report.version)
-        if other.time_s >= chosen.time_s and (other.report.instructor_action or not is_report):
-            status = "pending" if is_report else "not a report"
+        is_pending = other.report.instructor_action or not other.report.version
+        if is_pending and other.time_s >= chosen.time_s:
+            status = "pending" if other.report.version else "not a report"
             name = shorten_to_line(other.report.submission, 80)
             flags.append(f"The file {name} does not count for the grade: it is {status}.")
     return replace(
@@ -490,7 +485,7 @@ def match_overrides(
     """
     matched_overrides: list[dict[str, GradeOverride]] = [{} for _ in grades]
     max_points_of_reports = (report.max_points for grade in grades for report in grade.reports)
-    max_total_points = max(max_points_of_reports, default=math.inf)
+    max_points_of_class = max(max_points_of_reports, default=math.inf)
     class_list = ClassList(Person(grade.student_id, login=grade.file_name) for grade in grades)
     notes = []
     for student, override_by_item in overrides.items():
@@ -501,25 +496,29 @@ def match_overrides(
             notes.append(f"{OVERRIDES_NAME}: no student has the id {student_text}.")
             continue
         override_by_item_title = matched_overrides[student_index]
-        max_points_by_title = {TOTAL_TITLE: max_total_points, "": math.inf}
-        if report := grades[student_index].counted_report:
-            max_points_by_title[TOTAL_TITLE] = report.max_points
+        report = grades[student_index].counted_report
+        # titles that the instructor may use ("": comment on the whole report), and maximum points
+        max_points_by_title = {
+            TOTAL_TITLE: report.max_points if report else max_points_of_class,
+            "": math.inf,
+        }
+        if report:
             max_points_by_title |= {item.title: item.max_points for item in report.items}
+        # case and outer blanks may differ
         title_by_normalised_title = {normalise_text(title): title for title in max_points_by_title}
         for item_title, override in override_by_item.items():
-            title = title_by_normalised_title.get(normalise_text(item_title), item_title)
-            max_points, problem = max_points_by_title.get(title), ""
-            if max_points is None:
+            title, problem = title_by_normalised_title.get(normalise_text(item_title)), ""
+            if title is None:
                 problem = f"student {student_text} has no item {shorten_to_line(item_title, 60)!r}"
             elif title in override_by_item_title:
                 problem = f"student {student_text} has two rows for {title or 'the whole report'!r}"
-            elif (override.points or 0.0) > max_points:
+            elif (override.points or 0.0) > (max_points := max_points_by_title[title]):
                 limit_text = f"{max_points:g} points of {shorten_to_line(title, 60)!r}"
                 problem = f"points of student {student_text} are above the maximum, {limit_text}"
-            if problem:
-                notes.append(f"{OVERRIDES_NAME}: {problem}.")
             else:
                 override_by_item_title[title] = override
+            if problem:
+                notes.append(f"{OVERRIDES_NAME}: {problem}.")
     return matched_overrides, notes
 
 
@@ -562,17 +561,19 @@ def parse_due_time(
         if words and words[-1][0].isalpha():
             time_zone = ZoneInfo(words.pop())
         # ISO 8601: date, "T", time of day and offset from UTC
-        due_time = datetime.fromisoformat("T".join(words[:2]) + "".join(words[2:]))
+        iso_text = "T".join(words[:2]) + "".join(words[2:])
+        due_time = datetime.fromisoformat(iso_text)
     except (ZoneInfoNotFoundError, ValueError, OSError) as error:
         raise SettingsError(
             f"{name} {text!r} is not a valid time. Use '2026-11-20 23:59', optionally "
             "followed by a time zone ('+01:00' or 'Europe/Berlin')."
         ) from error
-    # a date means the end of the day, and a minute its last second
-    time_of_day_match = re.search(r"[^-W\d]\d\d(?::?\d\d(:?\d\d)?)?", "T".join(words))
-    if time_of_day_match is None:
-        due_time = due_time.replace(hour=23, minute=59, second=59)
-    elif time_of_day_match[1] is None:
+    with suppress(ValueError):
+        date.fromisoformat(iso_text)
+        # only a date: the end of the day
+        due_time = due_time.replace(hour=23, minute=59)
+    # without seconds (HH:MM:SS or HHMMSS): the last second of the minute
+    if not re.search(r"\D\d\d:?\d\d:?\d\d", iso_text):
         due_time = due_time.replace(second=59)
     if due_time.tzinfo is not None:
         return due_time
