@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 #: Suffixes of logs in a folder; a single file may have any suffix
 LOG_SUFFIXES = (".ulg", ".tlog", ".bin", ".ulg.gz", ".ulg.zst")
+# One of the protocols of fsspec's file system for the files of this computer
+LOCAL_PROTOCOL = "local"
 
 
 @dataclass(frozen=True, order=True)
@@ -79,7 +81,7 @@ def _find_logs_matching_pattern(pattern: str) -> list[LogAddress]:
     found_logs = []
     for path, size_bytes in size_by_path.items():
         address = path_for_table = path
-        if not _is_local(file_system):
+        if LOCAL_PROTOCOL not in file_system.protocol:
             address = path_for_table = file_system.unstrip_protocol(path)
         else:
             register_input_path(Path(path))
@@ -116,7 +118,7 @@ def local_file(address: str) -> Iterator[Path]:
         The URL requires a package that is not installed.
     """
     file_system, path = _open_file_system(address)
-    if _is_local(file_system):
+    if LOCAL_PROTOCOL in file_system.protocol:
         yield Path(path)
         return
     size_bytes, limit_bytes = file_system.info(path).get("size"), max_log_bytes.get()
@@ -147,12 +149,6 @@ def _open_file_system(address: str) -> tuple[AbstractFileSystem, str]:
             "Give the path of a log, or a URL with a protocol that fsspec supports.",
         ) from error
     return file_system, path
-
-
-def _is_local(file_system: AbstractFileSystem) -> bool:
-    from fsspec.implementations.local import LocalFileSystem  # noqa: PLC0415
-
-    return isinstance(file_system, LocalFileSystem)
 
 
 def _file_name(path: str) -> str:

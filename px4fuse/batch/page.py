@@ -213,12 +213,11 @@ def _make_drop_down_lists(logs: Sequence[LogSummary]) -> list[tuple[str, list[tu
             counts_by_label[label].update(values)
     drop_down_lists = []
     for label, counts in counts_by_label.items():
-        options = [
-            (f"{label}:{value}", f"{shorten_to_line(value, 60)} ({count})")
-            for value, count in counts.most_common()
-        ]
-        if options:
-            drop_down_lists.append((label, [("", "All"), *options]))
+        options = [("", "All")]
+        for value, count in counts.most_common():
+            options.append((f"{label}:{value}", f"{shorten_to_line(value, 60)} ({count})"))
+        if counts:
+            drop_down_lists.append((label, options))
     return drop_down_lists
 
 

@@ -2,7 +2,6 @@
 
 import shlex
 from collections.abc import Iterable, Mapping
-from functools import reduce
 from itertools import groupby, product
 from typing import Any
 
@@ -43,13 +42,13 @@ Row = dict[str, Any]
 
 def find_value(results: object, path: str) -> Any:
     """Return the value at a path such as "axes.north.updates", or None if it is missing."""
-
-    def get_child(parent: Any, name: str) -> Any:
-        if isinstance(parent, tuple):
-            return parent[int(name)]
-        return parent.get(name) if isinstance(parent, Mapping) else getattr(parent, name, None)
-
-    return reduce(get_child, path.split("."), results)
+    value: Any = results
+    for name in path.split("."):
+        if isinstance(value, tuple):
+            value = value[int(name)]
+        else:
+            value = value.get(name) if isinstance(value, Mapping) else getattr(value, name, None)
+    return value
 
 
 def make_axis_rows(results: ComparisonResults) -> list[Row]:

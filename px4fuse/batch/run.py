@@ -184,7 +184,7 @@ def run(
     requested_settings(request)  # raises SettingsError if a setting is out of range
     state = _BatchState(output, metadata.version("px4fuse"), command_line(request))
     jobs = _make_jobs(state, logs, request, reports)
-    log_by_address = {log.address: log for log in logs}
+
     run_in_processes = partial(
         run_with_limits, analyse, timeout_s=timeout_s, max_memory_bytes=int(memory_gb * 1e9)
     )
@@ -196,7 +196,7 @@ def run(
         progress("comparing logs", 0, len(jobs))
         try:
             for number, (job, outcome) in enumerate(finished_jobs, 1):
-                _cache_outcome(state, log_by_address[job.address], outcome)
+                _cache_outcome(state, job.log, outcome)
                 failure_count = len(state.failed_row_by_log_address)
                 progress(f"comparing logs, {failure_count} failed", number, len(jobs))
         except Px4FuseError as error:
@@ -223,7 +223,7 @@ def _make_jobs(
         hashes_by_size[cached_rows.size_bytes].add(cached_rows.sha256)
     max_bytes = max_log_bytes.get()
     return [
-        Job(log.address, request, reports, max_bytes, frozenset(hashes_by_size[log.size_bytes]))
+        Job(log, request, reports, max_bytes, frozenset(hashes_by_size[log.size_bytes]))
         for log in logs
     ]
 
@@ -253,7 +253,7 @@ def _cache_outcome(state: _BatchState, log: LogAddress, outcome: LogOutcome | Jo
     """Register a finished log in ``state``, and write its results."""
     if isinstance(outcome, JobFailure):
         remedy = "Increase --timeout or --memory, or run px4fuse compare on this log."
-        failed_row = make_failure_row(LogError(outcome.reason, remedy), STATUS_FAILED)
+        failed_row = make_failure_row(LogError(outcome.reason, remedy))
         state.failed_row_by_log_address[log.address] = failed_row
         return
     if outcome.rows and outcome.rows[0]["status"] == STATUS_FAILED:

@@ -31,8 +31,7 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
 
     request = comparison_request(log, option_values)
     with progress(json_path) as show_progress:
-        flight = read_flight(request, show_progress)
-        comparison = prepare_comparison(flight, request, show_progress)
+        comparison = prepare_comparison(read_flight(request, show_progress), request, show_progress)
         _, time_offset = estimate_noises_and_time_offset(comparison, show_progress)
         rerun = None
         if not isinstance(time_offset, Unavailable) and time_offset.is_significant(

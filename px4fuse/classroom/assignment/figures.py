@@ -7,7 +7,7 @@ import pandas as pd
 
 from px4fuse.comparison.comparison import compute_position_errors
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, Comparison, FilterName
-from px4fuse.core.record import Record, read_toml
+from px4fuse.core.record import read_toml
 from px4fuse.flight.model import Ekf2, Truth
 from px4fuse.report import panels, style
 from px4fuse.results.answer_form import CHOICE_LETTERS, Choice, ChoiceLetter
@@ -23,7 +23,7 @@ FIGURE_COUNT = 3
 STRAIGHT_PASS_COUNT = 4
 # Minimum velocity (m/s) in the positive direction of the path for a grey background of the plot
 MIN_SPEED_FOR_GREY_BACKGROUND_M_S = 0.2
-# Questions about each figure; the keys are fields of FigureAnswers
+# Questions about each figure; figures.toml contains the answers by these keys
 QUESTIONS = {
     "fault": "injected fault of the flight",
     "evidence": "plots that show the fault, and plots that do not show the fault",
@@ -33,34 +33,9 @@ QUESTIONS = {
 }
 
 
-class FigureAnswers(Record):
-    """Right answers to the questions about the figure of a simulated flight with one fault.
-
-    Attributes
-    ----------
-    fault : str
-        Name of the injected fault.
-    evidence : str
-        Plots that show the fault.
-    change : str
-        Smallest change that makes KF and EKF2 consistent.
-    prediction : str
-        Effect on KF and EKF2 if SIGMA_Z and EKF2_EVP_NOISE are multiplied by 3.
-    useless : str
-        Change that does not correct the fault, with the reason.
-    mistake_option : str
-        Value of ``px4fuse simulate --mistake`` for this fault; "" for a flight without a fault.
-    """
-
-    fault: str
-    evidence: str
-    change: str
-    prediction: str
-    useless: str
-    mistake_option: str = ""
-
-
-FIGURE_ANSWERS_BY_FAULT = read_toml(__file__, dict[str, FigureAnswers])
+# Right answers about a flight with one fault by key of the question, and the value of
+# ``px4fuse simulate --mistake`` for this fault ("mistake_option")
+FIGURE_ANSWERS_BY_FAULT = read_toml(__file__, dict[str, dict[str, str]])
 
 
 def _shuffle(
@@ -89,11 +64,9 @@ def make_choice_questions(
             FIGURE_ANSWERS_BY_FAULT.keys() - {kind}, f"{title} other", draw_number
         )
         fault_kinds = [kind, *other_fault_kinds[: len(CHOICE_LETTERS) - 1]]
-        for field, question in QUESTIONS.items():
-            shuffled_kinds = _shuffle(fault_kinds, f"{title} {field}", draw_number)
-            options = tuple(
-                getattr(FIGURE_ANSWERS_BY_FAULT[each], field) for each in shuffled_kinds
-            )
+        for key, question in QUESTIONS.items():
+            shuffled_kinds = _shuffle(fault_kinds, f"{title} {key}", draw_number)
+            options = tuple(FIGURE_ANSWERS_BY_FAULT[each][key] for each in shuffled_kinds)
             letter = CHOICE_LETTERS[shuffled_kinds.index(kind)]
             choices.append((Choice(f"{title}: {question}", options), letter))
     return tuple(choices)
@@ -125,8 +98,8 @@ def _simulate_flight(title: str, kind: str, draw_number: Callable[[str], float])
         seed=int(2**53 * draw_number_of_figure("seed")),
         **draw_scenario_numbers("aisle", draw_number_of_figure),
     )
-    faults = parse_faults(FIGURE_ANSWERS_BY_FAULT[kind].mistake_option.split())
-    return compare_simulation(flights.simulate(scenario, faults))
+    mistake_option = FIGURE_ANSWERS_BY_FAULT[kind].get("mistake_option", "")
+    return compare_simulation(flights.simulate(scenario, parse_faults(mistake_option.split())))
 
 
 def _plot_figures(comparisons: Mapping[str, Comparison]) -> bytes:

@@ -4,7 +4,7 @@ import math
 import statistics
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -155,10 +155,7 @@ def _make_grade_details(grade: Grade) -> Iterator[RowDetailsSection]:
         yield frame.make_list_section("Missing", ["No submission."])
         return
     verification = report.verification
-    differences = [
-        (difference.path, difference.recorded, difference.recomputed)
-        for difference in verification.differences
-    ]
+
     items = [
         (
             item.title,
@@ -177,7 +174,9 @@ def _make_grade_details(grade: Grade) -> Iterator[RowDetailsSection]:
     )
     yield frame.make_list_section("Verification", verification.reasons)
     yield frame.make_table_section(
-        "Numbers that differ in the new run", differences, ("Value", "Report", "New run")
+        "Numbers that differ in the new run",
+        [*map(astuple, verification.differences)],
+        ("Value", "Report", "New run"),
     )
     title = "Points (proposed)" if report.instructor_action else "Points"
     yield frame.make_table_section(title, items, ("Item", "Points", "Of", "Comment"), (1, 2))

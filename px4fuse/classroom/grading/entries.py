@@ -31,12 +31,10 @@ from ..assignment.roster import (
 )
 from .model import (
     TOTAL_TITLE,
-    ExportOrigin,
     Grade,
     GradedReport,
     GradeOverride,
     ItemScore,
-    Submission,
     select_counted_reports,
 )
 from .rubric import Rubric, flag_equal_contents
@@ -156,17 +154,9 @@ class _CandidateReport(NamedTuple):
 
 
 def build_grades(
-    reports: Sequence[GradedReport],
-    submissions: Sequence[Submission],
-    course: Course,
-    overrides: OverridesByStudent,
+    reports: Sequence[GradedReport], course: Course, overrides: OverridesByStudent
 ) -> tuple[tuple[Grade, ...], tuple[str, ...]]:
     """Assign the reports to students, and compute the grade of each student.
-
-    Parameters
-    ----------
-    reports, submissions : sequences
-        Graded report and file of each submission.
 
     Returns
     -------
@@ -175,7 +165,7 @@ def build_grades(
     notes : tuple of str
         Sentences about missing times, and about points without a matching student or item.
     """
-    grades = _choose_reports(reports, submissions, course)
+    grades = _choose_reports(reports, course)
     overrides_per_grade, notes = match_overrides(overrides, grades)
     flags_by_submission = flag_equal_contents(select_counted_reports(grades))
     grades_with_report = [grade for grade in grades if grade.counted_report]
@@ -192,24 +182,22 @@ def build_grades(
     return tuple(final_grades), tuple(notes)
 
 
-def _choose_reports(
-    reports: Sequence[GradedReport], submissions: Sequence[Submission], course: Course
-) -> list[Grade]:
+def _choose_reports(reports: Sequence[GradedReport], course: Course) -> list[Grade]:
     """Assign the reports to students, and choose the report that counts for each student.
 
     Each report of an unknown student gets a grade.
     """
     class_list, unknown_student_flag = course.class_list, "The student is not in the class list."
     if not class_list.people:
-        class_list = _collect_students(reports, submissions)
+        class_list = _collect_students(reports)
         unknown_student_flag = "Neither the report nor the learning platform names a student."
     candidates_by_student_index: dict[int, list[_CandidateReport]] = defaultdict(list)
     grades_of_unknown_students = []
-    for report, submission in zip(reports, submissions, strict=True):
-        student_index = class_list.find_student_index(submission.origin.person)
+    for report in reports:
+        student_index = class_list.find_student_index(report.origin.person)
         if student_index is None:
             student_index = class_list.find_student_index(Person(report.student_id, report.student))
-        candidate = _make_candidate(report, submission, course, student_index, class_list)
+        candidate = _make_candidate(report, course, student_index, class_list)
         if student_index is None:
             flags = (unknown_student_flag, *candidate.grade.flags)
             grades_of_unknown_students.append(replace(candidate.grade, flags=flags))
@@ -225,13 +213,11 @@ def _choose_reports(
     return [*grades_of_students, *grades_of_unknown_students]
 
 
-def _collect_students(
-    reports: Sequence[GradedReport], submissions: Sequence[Submission]
-) -> ClassList:
+def _collect_students(reports: Sequence[GradedReport]) -> ClassList:
     """Make a class list of the students that learning platforms and reports name."""
     class_list = ClassList()
-    for report, submission in zip(reports, submissions, strict=True):
-        person, new_id = submission.origin.person, report.student_id
+    for report in reports:
+        person, new_id = report.origin.person, report.student_id
         if class_list.find_student_index(Person(new_id)) is not None:
             new_id = ""  # the id in the report is that of a listed student
         if person.numbers or person.login:  # the learning platform identifies the student
@@ -250,17 +236,13 @@ def _collect_students(
 
 
 def _make_candidate(
-    report: GradedReport,
-    submission: Submission,
-    course: Course,
-    student_index: int | None,
-    class_list: ClassList,
+    report: GradedReport, course: Course, student_index: int | None, class_list: ClassList
 ) -> _CandidateReport:
     """Return a report with its submission time, and the grade that it gives to the student.
 
     The grade applies only if the report is chosen from all reports of the student.
     """
-    origin = submission.origin
+    origin = report.origin
     person = (
         Person(report.student_id) if student_index is None else class_list.people[student_index]
     )
@@ -270,7 +252,7 @@ def _make_candidate(
         due_time = parse_due_time(person.extended_due, name, due_time.tzinfo)
     submission_time = origin.time or parse_moodle_time(person.submission_time)
     if submission_time is not None:
-        submission_time = add_time_zone(submission_time, due_time)
+        submission_time = add_time_zone(submission_time, due_time.tzinfo if due_time else None)
     lateness_s, deducted_points = None, 0.0
     if due_time is not None and submission_time is not None:
         # UNIX times, because differences of datetime objects ignore daylight saving time
@@ -286,7 +268,7 @@ def _make_candidate(
         lateness_s=lateness_s,
         deducted_points=deducted_points,
         max_points=report.max_points,
-        flags=tuple(_flag_submission(report, origin, lateness_s, student_index, class_list)),
+        flags=tuple(_flag_submission(report, lateness_s, student_index, class_list)),
     )
     time_s = submission_time.timestamp() if submission_time else 0.0
     return _CandidateReport(time_s, report, grade)
@@ -294,12 +276,12 @@ def _make_candidate(
 
 def _flag_submission(
     report: GradedReport,
-    origin: ExportOrigin,
     lateness_s: float | None,
     student_index: int | None,
     class_list: ClassList,
 ) -> Iterator[str]:
     """Yield sentences about the time and the student of a submission."""
+    origin = report.origin
     platform = origin.platform.capitalize()
     if origin.is_late and lateness_s is None:
         yield (
@@ -575,16 +557,14 @@ def parse_due_time(
     # without seconds (HH:MM:SS or HHMMSS): the last second of the minute
     if not re.search(r"\D\d\d:?\d\d:?\d\d", iso_text):
         due_time = due_time.replace(second=59)
-    if due_time.tzinfo is not None:
-        return due_time
-    return due_time.replace(tzinfo=time_zone) if time_zone else due_time.astimezone()
+    return add_time_zone(due_time, time_zone)
 
 
-def add_time_zone(time: datetime, due_time: datetime | None) -> datetime:
-    """Add the time zone of ``due_time``, or of this computer, to a time without a time zone."""
+def add_time_zone(time: datetime, time_zone: tzinfo | None) -> datetime:
+    """Add a time zone (None: that of this computer) to a time without a time zone."""
     if time.tzinfo is not None:
         return time
-    return time.replace(tzinfo=due_time.tzinfo) if due_time is not None else time.astimezone()
+    return time.replace(tzinfo=time_zone) if time_zone else time.astimezone()
 
 
 def parse_moodle_time(text: str) -> datetime | None:

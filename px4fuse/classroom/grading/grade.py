@@ -107,7 +107,7 @@ def grade(
     reports, reused_count = _grade_submissions(
         found_submissions, course, output / RECORDS_FOLDER, processes, progress
     )
-    grades, override_notes = build_grades(reports, found_submissions, course, overrides)
+    grades, override_notes = build_grades(reports, course, overrides)
     written_paths, class_notes = write_grading_files(grades, course, output)
     all_notes = *notes, *unread_file_notes, *override_notes, *class_notes
     return GradeOutcome(grades, all_notes, reused_count, written_paths)
@@ -155,7 +155,9 @@ def _grade_submissions(
             submission, student = found_submissions[index], report.student
             if not student and not report.student_id:  # use the name from the learning platform
                 student = submission.origin.person.name
-            report_by_index[index] = replace(report, submission=submission.name, student=student)
+            report_by_index[index] = replace(
+                report, submission=submission.name, student=student, origin=submission.origin
+            )
             progress(len(report_by_index), len(found_submissions))
     return [report_by_index[index] for index in range(len(jobs))], reused_count
 

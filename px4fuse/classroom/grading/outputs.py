@@ -25,7 +25,6 @@ from px4fuse.errors import SettingsError
 from px4fuse.verification.model import Verification
 
 from ..assignment.roster import (
-    ClassList,
     Sheet,
     format_cell_number,
     format_csv,
@@ -151,14 +150,7 @@ def write_grading_files(
     # worksheets of the same name are from different folders
     table_names = make_unique((sheet.path.name for sheet in course.worksheets), "{1}-{0}")
     for sheet, name in zip(course.worksheets, table_names, strict=True):
-        filled_sheet, sheet_notes = fill_grades(
-            sheet,
-            grades,
-            course.class_list,
-            course.grade_column_title,
-            feedback_texts,
-            course.scale,
-        )
+        filled_sheet, sheet_notes = fill_grades(sheet, grades, course, feedback_texts)
         contents[f"{GRADES_FOLDER}/{name}"] = filled_sheet.content()
         notes += sheet_notes
     write_output_files({output / name: content for name, content in contents.items()})
@@ -438,23 +430,14 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
 
 
 def fill_grades(
-    sheet: Sheet,
-    grades: Sequence[Grade],
-    class_list: ClassList,
-    grade_column_title: str,
-    feedback_texts: Sequence[str],
-    platform_max_points: float | None = None,
+    sheet: Sheet, grades: Sequence[Grade], course: Course, feedback_texts: Sequence[str]
 ) -> tuple[Sheet, tuple[str, ...]]:
     """Enter grades and feedback into a copy of a table of a learning platform.
 
     Parameters
     ----------
     grades, feedback_texts : sequences
-        Grade and feedback of each student in ``class_list``, then of unknown students.
-    grade_column_title : str
-        Title of the grade column; "" if the table has only one.
-    platform_max_points : float, optional
-        Maximum points on the platform; by default those of the rubric.
+        Grade and feedback of each student in ``course.class_list``, then of unknown students.
 
     Returns
     -------
@@ -467,7 +450,8 @@ def fill_grades(
     SettingsError
         No grade column was found, or several.
     """
-    grade_column_index = find_grade_column(sheet, grade_column_title)
+    grade_column_index = find_grade_column(sheet, course.grade_column_title)
+    people = course.class_list.people
     feedback_column_index = sheet.find_column_index(COMMENT_COLUMN_TITLES)
     format_feedback = (
         neutralise_formulas
@@ -482,7 +466,7 @@ def fill_grades(
     notes, matched_student_indices = [], set()
     for row in cells_by_row:
         person = read_student(sheet, row)
-        student_index = class_list.find_student_index(person) if person else None
+        student_index = course.class_list.find_student_index(person) if person else None
         if student_index is None:
             continue
         matched_student_indices.add(student_index)
@@ -490,8 +474,8 @@ def fill_grades(
         points = grade.total
         if points is None:  # the cell is not changed
             continue
-        if platform_max_points is not None and grade.max_points:
-            points = round(points * platform_max_points / grade.max_points, 2)
+        if course.scale is not None and grade.max_points:
+            points = round(points * course.scale / grade.max_points, 2)
         max_points = _find_max_points(sheet, row, grade_column_index)
         if max_points is not None and points > max_points:
             notes.append(
@@ -507,7 +491,7 @@ def fill_grades(
             row[feedback_column_index] = format_feedback(feedback_texts[student_index])
     missing_names = [
         names[index]
-        for index in range(len(class_list.people))
+        for index in range(len(people))
         if index not in matched_student_indices and grades[index].total is not None
     ]
     if missing_names:

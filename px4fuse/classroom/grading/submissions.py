@@ -79,9 +79,12 @@ class _EntryError(Exception):
     """Reason why a zip entry or file is not read."""
 
 
-_BROKEN_ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, MemoryError)
-# zipfile raises NotImplementedError, a RuntimeError, for unknown compression methods
-_UNREADABLE_FILE_ERRORS = (_EntryError, *_BROKEN_ZIP_ERRORS, *BAD_VALUE_ERRORS)
+# Exceptions for damaged zip files and other unreadable files. For unknown compression methods,
+# zipfile raises NotImplementedError, a RuntimeError
+_UNREADABLE_FILE_ERRORS = (
+    *(_EntryError, zipfile.BadZipFile, zlib.error, struct.error, EOFError, MemoryError),
+    *BAD_VALUE_ERRORS,
+)
 
 
 def _format_unread_reason(error: Exception) -> str:
