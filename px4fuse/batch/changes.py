@@ -261,7 +261,8 @@ def _find_matching_paths(results: Results, pattern: str) -> Iterator[tuple[str, 
     parent, wildcard, pattern_end = pattern.partition(".*")
     if not wildcard:
         yield pattern, ()
-    for key in (find_value(results, parent) or ()) if wildcard else ():
+        return
+    for key in find_value(results, parent) or ():
         for path, keys in _find_matching_paths(results, f"{parent}.{key}{pattern_end}"):
             yield path, (key, *keys)
 

@@ -120,18 +120,15 @@ def grade(
     output: Path | None,
     title: str | None,
     roster: Path | None,
-    attempt: Any,
     due_time_text: str | None,
     late_rule_text: str | None,
     grace: float,
-    scale: float | None,
     questions: int | None,
-    include_pending: bool,
     worksheet: tuple[Path, ...],
     column: str | None,
-    anonymous: bool,
     jobs: int | None,
     write_rubric: Path | None,
+    **other_settings: Any,
 ) -> None:
     """Verify and grade the reports of a class.
 
@@ -167,14 +164,11 @@ def grade(
         roster=None if roster is None else read_people(read_csv_sheet(roster)),
         worksheets=tuple(map(read_csv_sheet, worksheet)),
         grade_column_title=column or "",
-        attempt=attempt,
         due=parse_due_time(due_time_text) if due_time_text else None,
         grace_period_s=60.0 * grace,
-        scale=scale,
         question_count=questions or 0,
         late_rule=parse_late_rule(late_rule_text) if late_rule_text else None,
-        include_pending=include_pending,
-        anonymous=anonymous,
+        **other_settings,  # attempt, scale, include_pending and anonymous
     )
     with folder_progress(output) as show_progress:
         outcome = grade_submissions(

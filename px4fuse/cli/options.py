@@ -42,14 +42,15 @@ if TYPE_CHECKING:
     from px4fuse.results.model import Student
 
 
-OptionDecorator = Callable[[Callable[..., None]], Callable[..., None]]
+CommandFunction = Callable[..., None]
+OptionDecorator = Callable[[CommandFunction], CommandFunction]
 Choice = partial(click.Choice, case_sensitive=False)
 
 
 def _combine_options(*options: OptionDecorator) -> OptionDecorator:
     """Combine options into one decorator; --help lists them in this order."""
 
-    def add_options(command: Callable[..., None]) -> Callable[..., None]:
+    def add_options(command: CommandFunction) -> CommandFunction:
         for option in reversed(options):
             command = option(command)
         return command

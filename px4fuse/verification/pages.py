@@ -191,11 +191,20 @@ class _PdfComparison:
             self.value_count += 1
             if self.value_count > MAX_PDF_VALUES:
                 raise LimitReachedError(f"the PDF contains more than {MAX_PDF_VALUES} values")
-            if isinstance(submitted_value, IndirectObject) and submitted_value.generation:
-                # programs that ignore generation numbers would display another object
-                yield f"another program changed the PDF entry {key}", _STRUCTURAL
-            if self._is_compared_before(submitted_value, redrawn_value):
-                continue
+            if isinstance(submitted_value, IndirectObject):
+                if submitted_value.generation:
+                    # programs that ignore generation numbers would display another object
+                    yield f"another program changed the PDF entry {key}", _STRUCTURAL
+                if isinstance(redrawn_value, IndirectObject):
+                    # objects may refer to each other in a cycle, so each pair is compared once
+                    object_ids = (
+                        submitted_value.idnum,
+                        submitted_value.generation,
+                        redrawn_value.idnum,
+                    )
+                    if object_ids in self.compared_objects:
+                        continue
+                    self.compared_objects.add(object_ids)
             submitted_value = resolve_reference(submitted_value)
             redrawn_value = resolve_reference(redrawn_value)
             if _pdf_type_of(submitted_value) is not _pdf_type_of(redrawn_value):
@@ -221,20 +230,6 @@ class _PdfComparison:
                     f"{redrawn_text!r}",
                     _CONTENT,
                 )
-
-    def _is_compared_before(self, submitted_value: Any, redrawn_value: Any) -> bool:
-        """Return True for references to compared objects, otherwise register the references.
-
-        PDF objects may refer to each other in a cycle, for example a page and its annotation.
-        """
-        if not isinstance(submitted_value, IndirectObject) or not isinstance(
-            redrawn_value, IndirectObject
-        ):
-            return False
-        object_ids = submitted_value.idnum, submitted_value.generation, redrawn_value.idnum
-        is_compared = object_ids in self.compared_objects
-        self.compared_objects.add(object_ids)
-        return is_compared
 
     def _compare_dictionaries(
         self, submitted_dictionary: Any, redrawn_dictionary: DictionaryObject, key: str

@@ -80,6 +80,8 @@ RESULT_TO_PRINTED_UNIT_FACTORS = (1.0, 100.0, 1000.0)
 MAX_NOTES_LINES = 5_000
 _NUMBER_PATTERN = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
+# Logs and other input files
+PathBySha256 = Mapping[str, Path]
 # Results of the new analysis, and a function that draws the PDF of these results
 RecomputedReport = tuple[ReportedResults, Callable[[], bytes]]
 # Function that links an input file; arguments: file name, SHA-256, label for messages
@@ -95,7 +97,7 @@ def log_sha256(results: ReportedResults) -> str:
 
 
 def recompute_report(
-    results: ReportedResults, path_by_sha256: Mapping[str, Path]
+    results: ReportedResults, path_by_sha256: PathBySha256
 ) -> RecomputedReport | Verification:
     """Repeat the analysis of a report with the settings in ``results``.
 
@@ -123,7 +125,7 @@ def recompute_report(
 
 
 def _link_input_file(
-    path_by_sha256: Mapping[str, Path], folder: Path, name: str, sha256: str | None, file_label: str
+    path_by_sha256: PathBySha256, folder: Path, name: str, sha256: str | None, file_label: str
 ) -> str:
     """Link the file with this SHA-256 into a temporary folder, and return the path of the link.
 
@@ -211,9 +213,7 @@ def _draw_report(
 # ------------------------------------------------------------------ the verdict
 
 
-def verify(
-    results: ReportedResults, pdf: bytes, path_by_sha256: Mapping[str, Path]
-) -> Verification:
+def verify(results: ReportedResults, pdf: bytes, path_by_sha256: PathBySha256) -> Verification:
     """Verify a report: repeat its analysis, draw it again, and compare numbers and pages.
 
     Parameters

@@ -25,6 +25,7 @@ from .key import (
     read_answer_key,
 )
 from .random_assignment import (
+    DrawRandomNumber,
     FlightKind,
     assign_random_flight,
     derive_hmac_key,
@@ -166,7 +167,7 @@ def write_assignment(
 
 
 def _make_missing_files(
-    log_file: Path, log: bytes, answer: CorrectAnswers, draw_number: Callable[[str], float]
+    log_file: Path, log: bytes, answer: CorrectAnswers, draw_number: DrawRandomNumber
 ) -> dict[Path, bytes]:
     """Return the contents of log, answer form and figures of a student, except existing files."""
     # the questions must be those of the answer key, also if an earlier version wrote the key

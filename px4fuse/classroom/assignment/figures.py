@@ -1,6 +1,6 @@
 """Multiple-choice questions about figures of simulated flights."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from io import BytesIO
 
 import pandas as pd
@@ -16,7 +16,7 @@ from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import make_scenario
 
 from .key import compare_simulation
-from .random_assignment import draw_scenario_numbers
+from .random_assignment import DrawRandomNumber, draw_scenario_numbers
 
 FIGURE_COUNT = 3
 # Number of straight passes along the path in each simulated flight
@@ -38,20 +38,18 @@ QUESTIONS = {
 FIGURE_ANSWERS_BY_FAULT = read_toml(__file__, dict[str, dict[str, str]])
 
 
-def _shuffle(
-    names: Iterable[str], seed_prefix: str, draw_number: Callable[[str], float]
-) -> list[str]:
+def _shuffle(names: Iterable[str], seed_prefix: str, draw_number: DrawRandomNumber) -> list[str]:
     return sorted(names, key=lambda name: draw_number(f"{seed_prefix} {name}"))
 
 
-def _select_fault_kinds(draw_number: Callable[[str], float]) -> dict[str, str]:
+def _select_fault_kinds(draw_number: DrawRandomNumber) -> dict[str, str]:
     """Select the injected fault of each figure at random; return the fault by figure title."""
     fault_kinds = _shuffle(FIGURE_ANSWERS_BY_FAULT, "figures", draw_number)[:FIGURE_COUNT]
     return {f"Figure {number}": kind for number, kind in enumerate(fault_kinds, start=1)}
 
 
 def make_choice_questions(
-    draw_number: Callable[[str], float],
+    draw_number: DrawRandomNumber,
 ) -> tuple[tuple[Choice, ChoiceLetter], ...]:
     """Make the multiple-choice questions about a student's plots, each with its right letter.
 
@@ -72,7 +70,7 @@ def make_choice_questions(
     return tuple(choices)
 
 
-def draw_figures(draw_number: Callable[[str], float]) -> bytes:
+def draw_figures(draw_number: DrawRandomNumber) -> bytes:
     """Simulate and plot the flights for a student's multiple-choice questions; return one PNG file.
 
     ``draw_number`` is as in :func:`make_choice_questions`.
@@ -85,7 +83,7 @@ def draw_figures(draw_number: Callable[[str], float]) -> bytes:
     )
 
 
-def _simulate_flight(title: str, kind: str, draw_number: Callable[[str], float]) -> Comparison:
+def _simulate_flight(title: str, kind: str, draw_number: DrawRandomNumber) -> Comparison:
     """Simulate and analyse the flight of a figure, with the injected fault ``kind``."""
 
     def draw_number_of_figure(name: str) -> float:

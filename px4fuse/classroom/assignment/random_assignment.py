@@ -22,6 +22,9 @@ from .roster import normalise_text
 
 # Kind of the simulated flights: along an aisle, around a loop, or one of both at random
 FlightKind = Literal["aisle", "loop", "mixed"]
+# Function that returns a random number in [0, 1) for the name of a quantity; equal names give equal
+# numbers
+DrawRandomNumber = Callable[[str], float]
 
 # Minimum length (characters) of the instructor's secret: a shorter secret can be guessed
 MIN_SECRET_LENGTH = 16
@@ -85,7 +88,7 @@ class AssignableFault(Record):
         is_masked = other_fault.group in (self.group, *self.masked_fault_groups.split())
         return not is_masked and self.group not in other_fault.masked_fault_groups.split()
 
-    def format_option(self, difficulty: float, draw_number: Callable[[str], float]) -> str:
+    def format_option(self, difficulty: float, draw_number: DrawRandomNumber) -> str:
         """Return the value of the option ``px4fuse simulate --mistake`` for this fault.
 
         Parameters
@@ -219,9 +222,7 @@ def assign_random_flight(
     return AssignedFlight(scenario, mistake_options, round(hardest_difficulty, 2))
 
 
-def draw_scenario_numbers(
-    kind: ScenarioKind, draw_number: Callable[[str], float]
-) -> dict[str, Any]:
+def draw_scenario_numbers(kind: ScenarioKind, draw_number: DrawRandomNumber) -> dict[str, Any]:
     """Return random values for the numeric fields of :class:`Scenario`."""
     return {
         name: round(low + (high - low) * draw_number(name), decimals)

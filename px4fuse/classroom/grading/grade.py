@@ -1,7 +1,7 @@
 """Grading of a class: verify and score all submitted reports in parallel, and write the output."""
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,7 +21,7 @@ from px4fuse.results.model import provenance
 from px4fuse.results.reading import read_results
 from px4fuse.verification.model import Verification
 from px4fuse.verification.pdf_input import read_report
-from px4fuse.verification.verification import log_sha256, recompute_report, verify
+from px4fuse.verification.verification import PathBySha256, log_sha256, recompute_report, verify
 
 from ..assignment.key import AnswerKey
 from . import submissions
@@ -165,7 +165,7 @@ def _grade_submissions(
 def grade_submission(
     rubric: Rubric,
     answer_key: AnswerKey | None,
-    path_by_sha256: Mapping[str, Path],
+    path_by_sha256: PathBySha256,
     records_folder: Path,
     max_bytes: int,
     job: tuple[Submission, str],
@@ -229,7 +229,7 @@ class VerificationRecord:
 def load_or_verify(
     records_folder: Path,
     pdf: bytes,
-    path_by_sha256: Mapping[str, Path],
+    path_by_sha256: PathBySha256,
     assigned_hashes: frozenset[str],
 ) -> tuple[ReportedResults, Verification, bool]:
     """Read and verify a report, or load the result of an earlier verification.
@@ -290,7 +290,7 @@ def load_or_verify(
 
 
 def _load_verification(
-    record_path: Path, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
+    record_path: Path, path_by_sha256: PathBySha256, assigned_hashes: frozenset[str]
 ) -> tuple[ReportedResults, Verification] | None:
     """Load an earlier verification; None if it is missing, unreadable or had other inputs."""
     try:
@@ -308,7 +308,7 @@ def _load_verification(
 
 
 def repeat_analysis_with_diagnosis(
-    results: ReportedResults, path_by_sha256: Mapping[str, Path]
+    results: ReportedResults, path_by_sha256: PathBySha256
 ) -> tuple[ReportedResults, bytes]:
     """Repeat the analysis and include the faults that were hidden from the student.
 
@@ -326,7 +326,7 @@ def repeat_analysis_with_diagnosis(
 
 
 def _collect_versions_and_files(
-    results: str, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
+    results: str, path_by_sha256: PathBySha256, assigned_hashes: frozenset[str]
 ) -> dict[str, str]:
     """Return the versions of libraries, and the availability of input files by SHA-256."""
     versions = provenance("")
