@@ -80,13 +80,13 @@ def _find_logs_matching_pattern(pattern: str) -> list[LogAddress]:
         )
     found_logs = []
     for path, size_bytes in size_by_path.items():
-        address = path_for_table = path
-        if LOCAL_PROTOCOL not in file_system.protocol:
-            address = path_for_table = file_system.unstrip_protocol(path)
-        else:
+        if LOCAL_PROTOCOL in file_system.protocol:
             register_input_path(Path(path))
+            address = path_for_table = path
             if not Path(pattern).is_absolute():
                 path_for_table = os.path.relpath(path)
+        else:
+            address = path_for_table = file_system.unstrip_protocol(path)
         found_logs.append(LogAddress(_file_name(path), path_for_table, address, size_bytes))
     return found_logs
 

@@ -40,10 +40,10 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
             rerun = rerun_kf_with_time_offset(comparison, time_offset)
     advice = make_time_offset_advice(comparison, time_offset, rerun)
     if isinstance(time_offset, Unavailable) or not time_offset.is_determinable:
-        log_name = comparison.flight.log.name
         remedy = time_offset.remedy if isinstance(time_offset, Unavailable) else advice["Action"]
         raise MissingDataError(
-            f"{log_name}: the time offset cannot be estimated: {time_offset.reason}",
+            f"{comparison.flight.log.name}: the time offset cannot be estimated: "
+            f"{time_offset.reason}",
             remedy,
         )
     results = make_sync_results(request, comparison, time_offset)

@@ -47,10 +47,12 @@ def make_results(results_type: type[ResultsT], command: str, **fields: Any) -> R
     ResultsError
         A required number is not valid.
     """
-    schema_by_type = {kind: name for name, kind in contract.RESULTS_BY_SCHEMA.items()}
+    schema_name = next(
+        name for name, kind in contract.RESULTS_BY_SCHEMA.items() if kind is results_type
+    )
     return drop_invalid_numbers(
         results_type(
-            schema=Schema(schema_by_type[results_type], SCHEMA_VERSION),
+            schema=Schema(schema_name, SCHEMA_VERSION),
             provenance=provenance(command),
             **fields,
         )

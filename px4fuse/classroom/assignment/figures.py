@@ -96,8 +96,8 @@ def _simulate_flight(title: str, kind: str, draw_number: DrawRandomNumber) -> Co
         seed=int(2**53 * draw_number_of_figure("seed")),
         **draw_scenario_numbers("aisle", draw_number_of_figure),
     )
-    mistake_option = FIGURE_ANSWERS_BY_FAULT[kind].get("mistake_option", "")
-    return compare_simulation(flights.simulate(scenario, parse_faults(mistake_option.split())))
+    faults = parse_faults(FIGURE_ANSWERS_BY_FAULT[kind].get("mistake_option", "").split())
+    return compare_simulation(flights.simulate(scenario, faults))
 
 
 def _plot_figures(comparisons: Mapping[str, Comparison]) -> bytes:

@@ -228,8 +228,8 @@ def list_answered_choices(
 ) -> list[AnsweredChoice]:
     letters = (*answers.choices, *[""] * len(right_answers.choices))
     return [
-        AnsweredChoice(choice, right_letter, letter)
-        for (choice, right_letter), letter in zip(right_answers.choices, letters, strict=False)
+        AnsweredChoice(*right_choice, letter)
+        for right_choice, letter in zip(right_answers.choices, letters, strict=False)
     ]
 
 
