@@ -46,7 +46,7 @@ class Clock:
 
 def analyse(work: job.Job) -> job.LogOutcome:
     """Analyse a log like the worker; a log named "hang" never ends, one named "crash" crashes."""
-    name = Path(work.address).stem
+    name = Path(work.log.address).stem
     if name in ("hang", "crash"):
         failing_jobs.run_job(("hang", 0) if name == "hang" else ("exit", 3))
     return analyse_cached(work)

@@ -42,7 +42,7 @@ def skip_verification(monkeypatch) -> list[str]:
 
     monkeypatch.setattr(grading, "verify", verify_by_log)
     monkeypatch.setattr(
-        grading, "repeat_analysis_with_diagnosis", lambda results, _: (results, b"")
+        grading, "repeat_analysis_with_diagnosis", lambda results, _: (results, b"PDF")
     )
     in_this_process(monkeypatch)
     return verified_ids

@@ -34,7 +34,7 @@ import px4fuse
 from px4fuse.batch import engine, job, run
 from px4fuse.batch.engine import connect_to_cluster, run_jobs
 from px4fuse.batch.job import Job
-from px4fuse.batch.logs import find_logs
+from px4fuse.batch.logs import LogAddress, find_logs
 from px4fuse.batch.rows import (
     COLUMN_TYPES,
     collect_log_values,
@@ -300,7 +300,12 @@ def test_batch_hanging_log_does_not_affect_other_logs(tmp_path, monkeypatch):
 
 def analysed(log: Path | str, max_bytes: int = 10**9) -> job.LogOutcome:
     """Analyse a log in a separate context, so that its size limit has no effect elsewhere."""
-    work = Job(str(log), ComparisonRequest(log="LOG"), False, max_bytes)
+    work = Job(
+        LogAddress("", "", str(log), None),
+        ComparisonRequest(log="LOG"),
+        False,
+        max_bytes,
+    )
     return contextvars.copy_context().run(job.analyse, work)
 
 

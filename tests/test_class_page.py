@@ -82,7 +82,14 @@ CLASS = (
     ),
     row("Émile", 9.0, id="1010"),
     row("Bo", 20.0, id="99"),
-    row("", None, file="broken.pdf", status="cannot verify", reasons=("Not a PDF.",)),
+    row(
+        "",
+        None,
+        file="broken.pdf",
+        status="cannot verify",
+        reasons=("Not a PDF.",),
+        instructor_action="Ask for the PDF.",
+    ),
     row(
         MARKUP,
         5.0,

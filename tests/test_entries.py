@@ -21,7 +21,7 @@ from px4fuse.classroom.grading.entries import (
     parse_moodle_time,
     read_overrides,
 )
-from px4fuse.classroom.grading.model import GradeOverride, Submission
+from px4fuse.classroom.grading.model import GradeOverride
 from px4fuse.classroom.grading.outputs import feedback_text
 from px4fuse.classroom.grading.rubric import read_rubric
 from px4fuse.classroom.grading.submissions import parse_submission_path
@@ -37,9 +37,11 @@ PEOPLE = (Person("1", "Ada Lovelace", login="ada"), Person("2", "Grace Hopper", 
 
 def make_grades(files, term=LATEST, overrides=None, people=PEOPLE):
     """Make the grades of reports, given by file name."""
-    reports = [replace(one, submission=name, sha256=name) for name, one in files.items()]
-    found = [Submission(Path("x.zip"), name, name, parse_submission_path(name)) for name in files]
-    return build_grades(reports, found, replace(term, roster=people), overrides or {})
+    reports = [
+        replace(one, submission=name, sha256=name, origin=parse_submission_path(name))
+        for name, one in files.items()
+    ]
+    return build_grades(reports, replace(term, roster=people), overrides or {})
 
 
 def blackboard(login: str, stamp: str, name: str = "r.pdf") -> str:
@@ -417,9 +419,9 @@ def test_late_rule_deducts_points_per_started_day_up_to_limit() -> None:
 def test_submission_time_without_zone_uses_zone_of_due_time() -> None:
     due = parse_due_time("2026-11-20 23:59:00 +05:30")
     bare = datetime(2026, 11, 21, 0, 59)
-    assert (add_time_zone(bare, due) - due).total_seconds() == 3600.0
+    assert (add_time_zone(bare, due.tzinfo) - due).total_seconds() == 3600.0
     told = datetime(2026, 11, 20, 18, 29, tzinfo=timezone(timedelta(0)))
-    assert add_time_zone(told, due) == due
+    assert add_time_zone(told, due.tzinfo) == due
 
 
 @pytest.mark.parametrize(

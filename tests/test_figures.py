@@ -30,9 +30,9 @@ def test_correct_answers_on_one_figure_describe_one_fault() -> None:
             rows = zip(choices[first:], QUESTIONS, strict=False)
             right = [(choice.answer_text(letter), field) for (choice, letter), field in rows]
             fault = next(
-                each for each in FIGURE_ANSWERS_BY_FAULT.values() if each.fault == right[0][0]
+                each for each in FIGURE_ANSWERS_BY_FAULT.values() if each["fault"] == right[0][0]
             )
-            assert all(getattr(fault, field) == text for text, field in right)
+            assert all(fault[field] == text for text, field in right)
         form = format_answer_form("s.ulg", "0" * 64, [choice for choice, _ in choices])
         assert len(form.encode()) < MAX_FORM_BYTES
 
@@ -48,7 +48,7 @@ def test_each_multiple_choice_letter_is_correct_equally_often() -> None:
 
 def test_answers_to_plot_questions_differ_between_faults() -> None:
     for field in QUESTIONS:
-        assert len({getattr(fault, field) for fault in FIGURE_ANSWERS_BY_FAULT.values()}) == len(
+        assert len({fault[field] for fault in FIGURE_ANSWERS_BY_FAULT.values()}) == len(
             FIGURE_ANSWERS_BY_FAULT
         )
 

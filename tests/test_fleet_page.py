@@ -16,7 +16,7 @@ from explore_tools import axe, serious
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from px4fuse.batch.page import format_html, sort_logs, summarise_logs
+from px4fuse.batch.page import format_html, summarise_logs
 from px4fuse.html.frame import MAX_PAGE_ROWS
 from px4fuse.report.card_html import MARKER_SVG_PATHS
 
@@ -63,7 +63,7 @@ def test_batch_page_sorts_logs_by_severity_and_rmse() -> None:
             name=["a", "b", "c", "d"],
         )
     )
-    assert [log["name"] for log in sort_logs(summarise_logs(table))] == ["c", "d", "b", "a"]
+    assert [log["name"] for log in summarise_logs(table)] == ["c", "d", "b", "a"]
 
 
 def test_batch_page_row_shows_diagnosis_action_and_sigma_ratios() -> None:
@@ -158,7 +158,7 @@ def test_batch_page_sorts_filters_and_opens_rows(page: Browser) -> None:
     page.click("tbody tr:first-child .name")
     ratios = {
         log["name"]: log["kf_source_ratio"]
-        for log in sort_logs(summarise_logs(artificial_logs(240)))
+        for log in summarise_logs(artificial_logs(240))
         if "kf_source_ratio" in log
     }
     assert page.names()[:3] == sorted(ratios, key=lambda name: ratios[name])[:3]

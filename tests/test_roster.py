@@ -17,8 +17,10 @@ from px4fuse.classroom.assignment.roster import (
     read_people,
     read_roster,
 )
+from px4fuse.classroom.grading.entries import Course
 from px4fuse.classroom.grading.model import ExportOrigin
 from px4fuse.classroom.grading.outputs import fill_grades, find_grade_column
+from px4fuse.classroom.grading.rubric import read_rubric
 from px4fuse.errors import SettingsError
 
 SUBMITTED = "Friday, 20 November 2026, 11:58 PM"
@@ -202,8 +204,8 @@ def rows(text: str, separator: str = ",") -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(text, newline=""), delimiter=separator))
 
 
-def class_list(sheet) -> ClassList:
-    return ClassList(PEOPLE, read_people(sheet))
+def course(people=PEOPLE, **settings) -> Course:
+    return Course(read_rubric(None), roster=tuple(people), **settings)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
@@ -219,7 +221,8 @@ def test_fill_grades_changes_only_grade_and_feedback(
     tmp_path, text, column, title, feedback, encoding
 ) -> None:
     sheet = table(tmp_path, text, encoding)
-    made, notes = fill_grades(sheet, GRADES, class_list(sheet), column, TEXTS)
+    lab = course(worksheets=(sheet,), grade_column_title=column)
+    made, notes = fill_grades(sheet, GRADES, lab, TEXTS)
     content = made.content()
     assert content[:2] == sheet.path.read_bytes()[:2]
     separator = "\t" if text is BLACKBOARD else ","
@@ -242,13 +245,13 @@ def test_fill_grades_changes_only_grade_and_feedback(
 def test_fill_grades_matches_anonymous_row_by_participant_number(tmp_path) -> None:
     hidden = MOODLE.replace("Doe Jane", "").replace("0042,jane@x.edu", ",")
     sheet = table(tmp_path, hidden)
-    people = ClassList([Person("0042", numbers={"moodle": "4711"}), *PEOPLE[1:]])
-    assert fill_grades(sheet, GRADES, people, "", TEXTS)[0].rows[0][5] == "87.5"
+    people = (Person("0042", numbers={"moodle": "4711"}), *PEOPLE[1:])
+    assert fill_grades(sheet, GRADES, course(people), TEXTS)[0].rows[0][5] == "87.5"
 
 
 def test_fill_grades_scales_points_to_the_platform_maximum(tmp_path) -> None:
     sheet = table(tmp_path, MOODLE)
-    scaled = fill_grades(sheet, GRADES, class_list(sheet), "", TEXTS, 50.0)[0]
+    scaled = fill_grades(sheet, GRADES, course(worksheets=(sheet,), scale=50.0), TEXTS)[0]
     maximum = GRADES[0].max_points
     assert float(scaled.rows[0][5]) == round(87.5 * 50.0 / maximum, 2)
 
@@ -260,18 +263,18 @@ def test_read_class_list_reads_due_time_extension(tmp_path) -> None:
 
 def test_fill_grades_reports_a_student_missing_in_the_table(tmp_path) -> None:
     sheet = table(tmp_path, "\r\n".join(MOODLE.split("\r\n")[:2]) + "\r\n")
-    _, notes = fill_grades(sheet, GRADES, class_list(sheet), "", TEXTS)
+    _, notes = fill_grades(sheet, GRADES, course(worksheets=(sheet,)), TEXTS)
     assert notes == ("table.csv has no row for Max Roe. These grades were not entered.",)
 
 
 def test_fill_grades_keeps_semicolon_and_decimal_comma(tmp_path) -> None:
     text = "Matrikelnummer;Name;Punkte;Kommentar\n0042;Jane Doe;;\n"
     sheet = table(tmp_path, text, "cp1252")
-    made, _ = fill_grades(sheet, GRADES, ClassList(PEOPLE), "", TEXTS)
+    made, _ = fill_grades(sheet, GRADES, course(), TEXTS)
     assert made.content() == b"Matrikelnummer;Name;Punkte;Kommentar\r\n0042;Jane Doe;87.5;\r\n"
     moodle = MOODLE.replace(",100.00,", ',"100,00",')
     sheet = table(tmp_path, moodle)
-    made, _ = fill_grades(sheet, GRADES, class_list(sheet), "", TEXTS)
+    made, _ = fill_grades(sheet, GRADES, course(worksheets=(sheet,)), TEXTS)
     assert made.rows[0][5] == "87,5"
 
 

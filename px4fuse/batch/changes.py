@@ -81,10 +81,7 @@ SETTING_PATHS_BY_LABEL = {
     "px4fuse": "provenance.px4fuse",
 }
 # If A and B are of different logs, `diff A B` copies only these settings from one to the other
-_FILTER_SETTINGS = {*Settings.__dataclass_fields__, "axes"}
-# If A and B are of the same log, `diff A B` copies all settings from one input to the other,
-# except these: they describe the input files
-_INPUT_FILE_SETTINGS = {"log", "system", "position"}
+_FILTER_SETTINGS = (*Settings.__dataclass_fields__, "axes")
 
 
 @dataclass(frozen=True)
@@ -157,14 +154,15 @@ def _analyse_log(
 ) -> InputResults:
     request = ComparisonRequest(log=str(path))
     if input_to_copy_settings_from is not None:
-        is_same_log = input_to_copy_settings_from.results.log.sha256 in hash_files([path])
-        copied_setting_names = (
-            {*request.__struct_fields__} - _INPUT_FILE_SETTINGS if is_same_log else _FILTER_SETTINGS
-        )
-        given_request = input_to_copy_settings_from.results.request
-        request = replace(
-            request, **{name: getattr(given_request, name) for name in copied_setting_names}
-        )
+        other_results = input_to_copy_settings_from.results
+        other_request = other_results.request
+        if other_results.log.sha256 in hash_files([path]):
+            # the same log: copy all settings, except those that describe the input files
+            request = replace(other_request, log=str(path), system=None, position=None)
+        else:
+            # another log: its times, position source and heading may differ
+            copied_settings = {name: getattr(other_request, name) for name in _FILTER_SETTINGS}
+            request = replace(request, **copied_settings)
     analysis = diagnose_or_check_aids(request, progress)
     # to_json rounds all numbers, as in a report
     results_json = to_json(make_comparison_or_aids_results(request, analysis))
@@ -229,29 +227,26 @@ def collect_compared_numbers(results: Results) -> dict[str, ComparedNumber]:
     axes = {} if isinstance(results, AidsResults) else results.axes
     # EKF2 rejects north and east together, so their rejected fractions are equal: keep only one
     horizontal_axes = [name for name in ("north", "east", AISLE_AXIS) if name in axes]
-    omitted_paths = [f"axes.{name}.rejected_fraction" for name in horizontal_axes[1:]]
+    omitted_prefixes = [f"axes.{name}.rejected_fraction" for name in horizontal_axes[1:]]
     # omit the aiding source whose positions KF also uses: ``axes`` already contains EKF2's mean NIS
     # and rejected fraction for these positions. EKF2 fuses all positions except those of GNSS as
     # external vision
     if find_value(results, "source.kind") == "gnss":
-        omitted_paths.append("aids.gnss_pos.")
+        omitted_prefixes.append("aids.gnss_pos.")
     elif axes:
-        omitted_paths += ["aids.ev_pos.", "aids.ev_hgt."]
+        omitted_prefixes += ["aids.ev_pos.", "aids.ev_hgt."]
     numbers_by_path: dict[str, ComparedNumber] = {}
     for definition in COMPARED_NUMBER_DEFINITIONS:
         interval_field = definition["interval"]
         for path, keys in _find_matching_paths(results, definition["path"]):
-            record_path, _, field_name = path.rpartition(".")
-            record = find_value(results, record_path)
-            value = getattr(record, field_name, None)
-            is_undetermined = (
-                isinstance(record, SourceTimeOffset) and not record.is_determinable
-            ) or (isinstance(record, HeadingError) and record.drifts)
-            if (
-                is_undetermined
-                or path.startswith(tuple(omitted_paths))
-                or not isinstance(value, int | float)
-            ):
+            record = find_value(results, path.rpartition(".")[0])
+            value = find_value(results, path)
+            if not isinstance(value, int | float) or path.startswith(tuple(omitted_prefixes)):
+                continue
+            # estimates that the data do not determine
+            if isinstance(record, SourceTimeOffset) and not record.is_determinable:
+                continue
+            if isinstance(record, HeadingError) and record.drifts:
                 continue
             labels = (AIDS[name].label if name in AIDS else name for name in keys)
             numbers_by_path[path] = ComparedNumber(
@@ -271,7 +266,8 @@ def _find_matching_paths(results: Results, pattern: str) -> Iterator[tuple[str, 
     parent, wildcard, pattern_end = pattern.partition(".*")
     if not wildcard:
         yield pattern, ()
-    for key in (find_value(results, parent) or ()) if wildcard else ():
+        return
+    for key in find_value(results, parent) or ():
         for path, keys in _find_matching_paths(results, f"{parent}.{key}{pattern_end}"):
             yield path, (key, *keys)
 
@@ -304,10 +300,10 @@ def compare_numbers(
             path=path,
             label=described_number.label,
             unit=described_number.unit,
-            a=getattr(number_a, "value", None),
-            b=getattr(number_b, "value", None),
-            a_interval=getattr(number_a, "interval", None),
-            b_interval=getattr(number_b, "interval", None),
+            a=number_a.value if number_a else None,
+            b=number_b.value if number_b else None,
+            a_interval=number_a.interval if number_a else None,
+            b_interval=number_b.interval if number_b else None,
         )
 
 
@@ -332,17 +328,20 @@ def _describe_worse_verdicts(
     "error" that only B contains.
     """
     nis_and_nees_a, nis_and_nees_b = map(_collect_nis_and_nees, (results_a, results_b))
-    for label, (mean_nis_or_nees_a, was_consistent) in nis_and_nees_a.items():
-        mean_nis_or_nees_b, is_consistent = nis_and_nees_b.get(label, (mean_nis_or_nees_a, True))
-        if was_consistent and not is_consistent:
-            ratio = mean_nis_or_nees_b**0.5
+    for label, (mean_a, is_consistent_in_a) in nis_and_nees_a.items():
+        if label not in nis_and_nees_b:
+            continue
+        mean_b, is_consistent_in_b = nis_and_nees_b[label]
+        if is_consistent_in_a and not is_consistent_in_b:
+            # NIS and NEES are squares of actual ÷ reported σ
+            ratio = mean_b**0.5
             factor_text = format_factor(max(ratio, 1.0 / ratio))
             verdict_text = f"overconfident, σ {factor_text} times too small"
             if ratio < 1.0:
                 verdict_text = f"underconfident, σ {factor_text} times too large"
             yield (
-                f"{label}: {format_number(mean_nis_or_nees_a)} (consistent) → "
-                f"{format_number(mean_nis_or_nees_b)} ({verdict_text})."
+                f"{label}: {format_number(mean_a)} (consistent) → "
+                f"{format_number(mean_b)} ({verdict_text})."
             )
     error_ids = [
         finding.id for finding in findings if (finding.only_in, finding.severity) == ("B", "error")

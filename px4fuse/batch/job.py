@@ -10,7 +10,7 @@ from px4fuse.core.reading import hash_files, max_log_bytes
 from px4fuse.errors import LogError, MissingDataError, Px4FuseError
 from px4fuse.request import ComparisonRequest, replace_argument_names
 
-from .logs import local_file
+from .logs import LogAddress, local_file
 from .rows import (
     STATUS_FAILED,
     STATUS_NOT_COMPARED,
@@ -27,15 +27,13 @@ class Job:
 
     Attributes
     ----------
-    address : str
-        Absolute path or URL of the log.
     max_bytes : int
         Maximum size of the log.
     finished_hashes : frozenset of str
         SHA-256 of logs with results from an earlier run.
     """
 
-    address: str
+    log: LogAddress
     request: ComparisonRequest
     writes_report: bool
     max_bytes: int
@@ -57,7 +55,7 @@ def analyse(job: Job) -> LogOutcome:
     sha256 = ""
     max_log_bytes.set(job.max_bytes)
     try:
-        with local_file(job.address) as path:
+        with local_file(job.log.address) as path:
             (sha256,) = hash_files([path])
             if sha256 in job.finished_hashes:
                 return LogOutcome(sha256)
@@ -69,13 +67,12 @@ def analyse(job: Job) -> LogOutcome:
                 )
             return outcome
     except Px4FuseError as error:
-        return LogOutcome(
-            sha256, (make_failure_row(error, STATUS_FAILED) | {"log_sha256": sha256},)
-        )
+        return LogOutcome(sha256, (make_failure_row(error) | {"log_sha256": sha256},))
 
 
-def make_failure_row(error: Px4FuseError, status: str, name: str = "") -> Row:
+def make_failure_row(error: Px4FuseError, name: str = "") -> Row:
     """Return the columns with status, reason and action for a log without results."""
+    status = STATUS_NOT_COMPARED if isinstance(error, MissingDataError) else STATUS_FAILED
     reason = replace_argument_names(error.reason).removeprefix(f"{name}: ")
     return {"status": status, "reason": reason, "remedy": replace_argument_names(error.remedy)}
 
@@ -103,8 +100,7 @@ def _compare_log(job: Job, path: Path, sha256: str) -> LogOutcome:
 
             report_pdf = render_pdf(analysis, comparison_results, results_json)
     except Px4FuseError as error:
-        status = STATUS_NOT_COMPARED if isinstance(error, MissingDataError) else STATUS_FAILED
-        return LogOutcome(sha256, (row | make_failure_row(error, status, path.name),))
+        return LogOutcome(sha256, (row | make_failure_row(error, path.name),))
     return LogOutcome(
         sha256, tuple(make_axis_rows(comparison_results)), results_json.encode(), report_pdf
     )

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 #: Suffixes of logs in a folder; a single file may have any suffix
 LOG_SUFFIXES = (".ulg", ".tlog", ".bin", ".ulg.gz", ".ulg.zst")
+# One of the protocols of fsspec's file system for the files of this computer
+LOCAL_PROTOCOL = "local"
 
 
 @dataclass(frozen=True, order=True)
@@ -63,22 +65,8 @@ def _find_logs_matching_pattern(pattern: str) -> list[LogAddress]:
     if not pattern:
         raise SettingsError("the name of a log is empty", "Give files, folders, globs or URLs.")
     file_system, root_path = _open_file_system(pattern)
-    is_local = _is_local(file_system)
     try:
-        if file_system.exists(root_path) and not file_system.isdir(root_path):
-            # the path may also be a device or a pipe, without a size: a worker process rejects it
-            # with a message
-            is_file = file_system.isfile(root_path)
-            size_by_path = {root_path: file_system.size(root_path) if is_file else None}
-        else:
-            is_folder = file_system.isdir(root_path)
-            list_files = file_system.find if is_folder else file_system.glob
-            size_by_path = {
-                path: file_info.get("size")
-                for path, file_info in list_files(root_path, detail=True).items()
-                if file_info.get("type", "file") == "file"
-                and (not is_folder or path.lower().endswith(LOG_SUFFIXES))
-            }
+        size_by_path = _find_file_sizes(file_system, root_path)
     # fsspec raises exceptions of many types, for example for an unknown account
     except Exception as error:
         raise SettingsError(
@@ -92,13 +80,30 @@ def _find_logs_matching_pattern(pattern: str) -> list[LogAddress]:
         )
     found_logs = []
     for path, size_bytes in size_by_path.items():
-        address = path if is_local else file_system.unstrip_protocol(path)
-        is_relative_path = is_local and not Path(pattern).is_absolute()
-        path_for_table = os.path.relpath(path) if is_relative_path else address
-        found_logs.append(LogAddress(_file_name(path), path_for_table, address, size_bytes))
-        if is_local:
+        if LOCAL_PROTOCOL in file_system.protocol:
             register_input_path(Path(path))
+            address = path_for_table = path
+            if not Path(pattern).is_absolute():
+                path_for_table = os.path.relpath(path)
+        else:
+            address = path_for_table = file_system.unstrip_protocol(path)
+        found_logs.append(LogAddress(_file_name(path), path_for_table, address, size_bytes))
     return found_logs
+
+
+def _find_file_sizes(file_system: AbstractFileSystem, path: str) -> dict[str, int | None]:
+    """Return the size of each log in a folder, of each file that matches a glob, or of a file."""
+    if file_system.isdir(path):
+        files = file_system.find(path, detail=True)
+        files = {name: files[name] for name in files if name.lower().endswith(LOG_SUFFIXES)}
+    elif file_system.exists(path):
+        # also a device or pipe, which a worker process rejects with a message
+        return {path: file_system.size(path) if file_system.isfile(path) else None}
+    else:
+        files = file_system.glob(path, detail=True)
+    return {
+        name: info.get("size") for name, info in files.items() if info.get("type", "file") == "file"
+    }
 
 
 @contextmanager
@@ -113,7 +118,7 @@ def local_file(address: str) -> Iterator[Path]:
         The URL requires a package that is not installed.
     """
     file_system, path = _open_file_system(address)
-    if _is_local(file_system):
+    if LOCAL_PROTOCOL in file_system.protocol:
         yield Path(path)
         return
     size_bytes, limit_bytes = file_system.info(path).get("size"), max_log_bytes.get()
@@ -144,12 +149,6 @@ def _open_file_system(address: str) -> tuple[AbstractFileSystem, str]:
             "Give the path of a log, or a URL with a protocol that fsspec supports.",
         ) from error
     return file_system, path
-
-
-def _is_local(file_system: AbstractFileSystem) -> bool:
-    from fsspec.implementations.local import LocalFileSystem  # noqa: PLC0415
-
-    return isinstance(file_system, LocalFileSystem)
 
 
 def _file_name(path: str) -> str:

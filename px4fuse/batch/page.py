@@ -1,7 +1,7 @@
 """Web page of ``px4fuse batch``: a sortable table with one row per log."""
 
 import math
-from collections import ChainMap, Counter, defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import zip_longest
 from typing import Any
@@ -72,7 +72,7 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
     version_text : str
         Name and version of px4fuse.
     """
-    logs = sort_logs(summarise_logs(table))
+    logs = summarise_logs(table)
     rows = [
         Row(
             _make_log_cells(log),
@@ -213,12 +213,11 @@ def _make_drop_down_lists(logs: Sequence[LogSummary]) -> list[tuple[str, list[tu
             counts_by_label[label].update(values)
     drop_down_lists = []
     for label, counts in counts_by_label.items():
-        options = [
-            (f"{label}:{value}", f"{shorten_to_line(value, 60)} ({count})")
-            for value, count in counts.most_common()
-        ]
-        if options:
-            drop_down_lists.append((label, [("", "All"), *options]))
+        options = [("", "All")]
+        for value, count in counts.most_common():
+            options.append((f"{label}:{value}", f"{shorten_to_line(value, 60)} ({count})"))
+        if counts:
+            drop_down_lists.append((label, options))
     return drop_down_lists
 
 
@@ -226,13 +225,13 @@ def _make_drop_down_lists(logs: Sequence[LogSummary]) -> list[tuple[str, list[tu
 
 
 def summarise_logs(table: pd.DataFrame) -> list[LogSummary]:
-    """Combine the table rows of each log, one per axis, into one summary."""
+    """Combine the table rows of each log, one per axis, into one summary; sort the summaries."""
     rows_by_log: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in table.to_dict("records"):
         rows_by_log[row["log"]].append(
             {str(name): value for name, value in row.items() if pd.notna(value) and value != ""}
         )
-    return [_summarise_log(rows) for rows in rows_by_log.values()]
+    return sort_logs(map(_summarise_log, rows_by_log.values()))
 
 
 def _summarise_log(rows: list[dict[str, Any]]) -> LogSummary:
@@ -240,14 +239,16 @@ def _summarise_log(rows: list[dict[str, Any]]) -> LogSummary:
 
     The summary contains the values of the preferred axis, and values that combine all axes.
     """
-    # the values of the first row, and those that only later rows contain
-    summary: dict[str, Any] = dict(
-        ChainMap(*sorted(rows, key=lambda row: AXES_BY_PREFERENCE.index(row.get("axis", "aisle"))))
-    )
+    summary: dict[str, Any] = {}
+    # the preferred axis is the last, so that its values replace those of the other axes
+    for row in sorted(
+        rows, key=lambda row: AXES_BY_PREFERENCE.index(row.get("axis", "aisle")), reverse=True
+    ):
+        summary |= row
     # a log is done if the results of at least one axis are done
     is_done = any(row["status"] == STATUS_DONE for row in rows)
     summary["status"] = STATUS_DONE if is_done else rows[0]["status"]
-    if "headline" not in summary:  # a log without results
+    if "headline" not in summary:  # a log without results has no diagnosis: show the reason instead
         is_refused = summary["status"] != STATUS_NOT_COMPARED
         status_text = "refused" if is_refused else STATUS_NOT_COMPARED
         summary |= {

@@ -2,7 +2,6 @@
 
 import shlex
 from collections.abc import Iterable, Mapping
-from functools import reduce
 from itertools import groupby, product
 from typing import Any
 
@@ -44,13 +43,13 @@ Row = dict[str, Any]
 
 def find_value(results: object, path: str) -> Any:
     """Return the value at a path such as "axes.north.updates", or None if it is missing."""
-
-    def get_child(parent: Any, name: str) -> Any:
-        if isinstance(parent, tuple):
-            return parent[int(name)]
-        return parent.get(name) if isinstance(parent, Mapping) else getattr(parent, name, None)
-
-    return reduce(get_child, path.split("."), results)
+    value: Any = results
+    for name in path.split("."):
+        if isinstance(value, tuple):
+            value = value[int(name)]
+        else:
+            value = value.get(name) if isinstance(value, Mapping) else getattr(value, name, None)
+    return value
 
 
 def make_axis_rows(results: ComparisonResults) -> list[Row]:
@@ -127,12 +126,14 @@ def find_first_action(card: DiagnosisCard) -> str:
     if not card.causes:
         return ""
     first_cause = card.causes[0]
-    for action in (
-        *(first_cause.alternatives[0] if first_cause.alternatives else ()),
-        *first_cause.actions,
-    ):
+    # the user takes one group of alternatives, and then the further actions
+    actions = first_cause.actions
+    if first_cause.alternatives:
+        actions = first_cause.alternatives[0] + actions
+    for action in actions:
         if action.commands:
             return "\n".join(action.commands)
+        # a change without commands comes first, for example of a sensor: give its text
         if action.changes_something():
             break
     return card.do_this[0] if card.do_this else ""

@@ -183,39 +183,49 @@ def run(
         raise SettingsError("A position file belongs to one flight. Omit `position` for many logs.")
     requested_settings(request)  # raises SettingsError if a setting is out of range
     state = _BatchState(output, metadata.version("px4fuse"), command_line(request))
+    jobs = _make_jobs(state, logs, request, reports)
+
+    run_in_processes = partial(
+        run_with_limits, analyse, timeout_s=timeout_s, max_memory_bytes=int(memory_gb * 1e9)
+    )
+    with (
+        connect_to_cluster(scheduler) as client,
+        # closing() ends the worker processes, also after an error or Ctrl-C
+        closing(run_jobs(client, run_in_processes, jobs, workers)) as finished_jobs,
+    ):
+        progress("comparing logs", 0, len(jobs))
+        try:
+            for number, (job, outcome) in enumerate(finished_jobs, 1):
+                _cache_outcome(state, job.log, outcome)
+                failure_count = len(state.failed_row_by_log_address)
+                progress(f"comparing logs, {failure_count} failed", number, len(jobs))
+        except Px4FuseError as error:
+            if (output / "rows").is_dir():
+                error.args = (f"{error} {RESUME_NOTE}",)
+            raise
+        finally:
+            # also after an error or an interruption: write the results so far. Without an error,
+            # each log is finished or failed
+            if state.hash_by_log_address or state.failed_row_by_log_address:
+                batch_result = _write_table(state, logs)
+    return batch_result
+
+
+def _make_jobs(
+    state: _BatchState, logs: Iterable[LogAddress], request: ComparisonRequest, reports: bool
+) -> list[Job]:
+    """Return a job for each log, and register in ``state`` the logs of an earlier run."""
     # a worker process computes the SHA-256 of a log, and compares it only with finished logs of the
     # same size: a set of all finished logs would be large
     hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
     for cached_rows in load_cached_rows(state, reports):
         state.cached_rows_by_hash[cached_rows.sha256] = cached_rows
         hashes_by_size[cached_rows.size_bytes].add(cached_rows.sha256)
-    log_by_address = {log.address: log for log in logs}
     max_bytes = max_log_bytes.get()
-    jobs = [
-        Job(log.address, request, reports, max_bytes, frozenset(hashes_by_size[log.size_bytes]))
+    return [
+        Job(log, request, reports, max_bytes, frozenset(hashes_by_size[log.size_bytes]))
         for log in logs
     ]
-    run_in_processes = partial(
-        run_with_limits, analyse, timeout_s=timeout_s, max_memory_bytes=int(memory_gb * 1e9)
-    )
-    with (
-        connect_to_cluster(scheduler) as client,
-        closing(run_jobs(client, run_in_processes, jobs, workers)) as finished_jobs,
-    ):
-        progress("comparing logs", 0, len(jobs))
-        try:
-            for number, (job, outcome) in enumerate(finished_jobs, 1):
-                _cache_outcome(state, log_by_address[job.address], outcome)
-                failure_count = len(state.failed_row_by_log_address)
-                progress(f"comparing logs, {failure_count} failed", number, len(jobs))
-        except Px4FuseError as error:
-            resume_note = RESUME_NOTE if (output / "rows").is_dir() else ""
-            raise type(error)(f"{error} {resume_note}".rstrip()) from error
-        finally:
-            # also after an error or an interruption: write the results so far
-            if state.hash_by_log_address or state.failed_row_by_log_address:
-                batch_result = _write_table(state, logs)
-    return batch_result
 
 
 def load_cached_rows(state: _BatchState, reports: bool) -> Iterator[CachedRows]:
@@ -244,12 +254,13 @@ def _cache_outcome(state: _BatchState, log: LogAddress, outcome: LogOutcome | Jo
     """Register a finished log in ``state``, and write its results."""
     if isinstance(outcome, JobFailure):
         remedy = "Increase --timeout or --memory, or run px4fuse compare on this log."
-        error = LogError(outcome.reason.rstrip("."), remedy)
-        outcome = LogOutcome("", (make_failure_row(error, STATUS_FAILED),))
+        failed_row = make_failure_row(LogError(outcome.reason, remedy))
+        state.failed_row_by_log_address[log.address] = failed_row
+        return
     if outcome.rows and outcome.rows[0]["status"] == STATUS_FAILED:
         state.failed_row_by_log_address[log.address] = outcome.rows[0]
         return
-    if not outcome.rows:
+    if not outcome.rows:  # a log with results from an earlier run
         state.reused_hashes.add(outcome.sha256)
     elif outcome.sha256 not in state.cached_rows_by_hash:  # otherwise two logs are identical
         state.cached_rows_by_hash[outcome.sha256] = _write_log(state, log, outcome)
@@ -258,20 +269,17 @@ def _cache_outcome(state: _BatchState, log: LogAddress, outcome: LogOutcome | Jo
 
 def _write_log(state: _BatchState, log: LogAddress, outcome: LogOutcome) -> CachedRows:
     path_stem = f"results/{make_file_stem(log.name, outcome.sha256)}"
-    content_by_name = {
-        f"{path_stem}.json": outcome.results_json,
-        f"{path_stem}.pdf": outcome.report_pdf,
-    }
-    path_by_column = {
-        column: name if content_by_name[name] else ""
-        for column, name in zip(OUTPUT_FILE_COLUMNS, content_by_name, strict=True)
-    }
-    rows = [clean_row(row) | path_by_column for row in outcome.rows]
+    # a log that was not compared has no results, and without --reports there is no PDF
+    json_path = f"{path_stem}.json" if outcome.results_json else ""
+    pdf_path = f"{path_stem}.pdf" if outcome.report_pdf else ""
+    rows = [clean_row(row) | {"results": json_path, "report": pdf_path} for row in outcome.rows]
     cached_rows = CachedRows(outcome.sha256, state.version, state.settings, log.size_bytes, rows)
-    content_by_name[f"rows/{outcome.sha256}.json"] = msgspec.json.encode(cached_rows)
-    write_output_files(
-        {state.output / name: content for name, content in content_by_name.items() if content}
-    )
+    contents = {
+        json_path: outcome.results_json,
+        pdf_path: outcome.report_pdf,
+        f"rows/{outcome.sha256}.json": msgspec.json.encode(cached_rows),
+    }
+    write_output_files({state.output / path: data for path, data in contents.items() if path})
     return cached_rows
 
 

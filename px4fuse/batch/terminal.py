@@ -11,7 +11,7 @@ from .changes import (
     MIN_DIFFERENCE_OF_LISTED_NUMBERS,
     MIN_RELATIVE_DIFFERENCE_OF_LISTED_NUMBERS,
 )
-from .page import SIGMA_RATIO_LABELS, LogSummary, sort_logs, summarise_logs
+from .page import SIGMA_RATIO_LABELS, LogSummary, summarise_logs
 from .rows import STATUS_FAILED
 from .run import BatchResult
 
@@ -37,7 +37,7 @@ def format_summary(batch_result: BatchResult) -> Page:
         page.write(text, colour=ERROR_COLOUR if status == STATUS_FAILED else WARNING_COLOUR)
     if (unlisted_count := len(logs_by_reason) - MAX_LISTED_REASONS) > 0:
         page.write(f"fleet.html also lists {unlisted_count} other reasons for missing results.")
-    sorted_logs = sort_logs(summarise_logs(batch_result.table))
+    sorted_logs = summarise_logs(batch_result.table)
     if sorted_logs:
         rows = [_make_log_row(log) for log in sorted_logs[:MAX_LISTED_LOGS]]
         page.add_table(
@@ -117,8 +117,9 @@ def _format_setting(value: float | str | None) -> str:
 def _format_value(value: float | None, interval: ConfidenceInterval | None, unit: str) -> str:
     if value is None:
         return "missing"
-    factor, unit = (100.0, "%") if unit == "share" else (1.0, unit)
-    text = f"{format_number(factor * value)} {unit}".rstrip()
+    if unit == "share":  # a share has no interval
+        return f"{format_number(100.0 * value)} %"
+    text = f"{format_number(value)} {unit}".rstrip()
     if interval is None:
         return text
     low, high = interval

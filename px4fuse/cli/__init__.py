@@ -171,15 +171,14 @@ def main() -> None:
     for signal_number in TERMINATION_SIGNALS:
         if signal.getsignal(signal_number) is signal.SIG_DFL:  # under nohup, SIGHUP is ignored
             signal.signal(signal_number, _raise_interrupt)
+    exit_code: object = 2  # unless the command ends without an error
     try:
         exit_code = cli.main(standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()
-        exit_code = 2
     except click.UsageError as error:
         command_name = error.ctx.command_path if error.ctx else "px4fuse"
         _print_error(f"{error.format_message()} See {command_name} --help.")
-        exit_code = 2
     except (Px4FuseError, Interrupted) as error:
         _print_error(str(error))
         exit_code = getattr(error, "exit_code", 2)
@@ -188,7 +187,6 @@ def main() -> None:
         exit_code = 0
     except OSError as error:  # click cannot print --help or --version
         _print_error(f"standard output cannot be written ({error.strerror}); nothing was written.")
-        exit_code = 2
     sys.exit(_flush_output(exit_code if isinstance(exit_code, int) else 0))
 
 

@@ -31,8 +31,8 @@ def parse_delta(text: str) -> RpePairDistance:
         raise click.BadParameter(
             f"The RPE delta {text!r} is not a distance (5m), time (10s) or number of frames (1f)."
         )
-    unit = {"m": "m", "s": "s"}.get(match[2], "frames")
-    return RpePairDistance(float(match[1]), unit)  # type: ignore[arg-type]
+    unit: Any = "frames" if match[2] == "f" else match[2]
+    return RpePairDistance(float(match[1]), unit)
 
 
 _evaluation_option = partial(options.request_option, EvaluationRequest)

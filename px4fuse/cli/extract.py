@@ -58,16 +58,16 @@ def extract(
 
     flight = extraction.add_source_innovations(read_flight(comparison_request(log, option_values)))
     _require_same_flight(output, flight.log.sha256)
-    tables = extraction.tables(flight)
+    tables = {f"{name}.{format}": table for name, table in extraction.tables(flight).items()}
     contents = {
-        output / f"{name}.{format}": extraction.to_bytes(table, format)
-        for name, table in tables.items()
+        output / file_name: extraction.to_bytes(table, format)
+        for file_name, table in tables.items()
     }
     contents[output / "flight.json"] = to_json(extraction.describe_flight(flight)).encode()
     write_outputs(contents)
     click.echo(f"Wrote to {to_one_line(str(output))}:")
-    for name, table in tables.items():
-        click.echo(f"  {f'{name}.{format}':44} {len(table):8} rows")
+    for file_name, table in tables.items():
+        click.echo(f"  {file_name:44} {len(table):8} rows")
     click.echo("  flight.json")
     for missing_part in extraction.list_missing_data(flight):
         click.echo(f"Not exported: {missing_part.what} ({missing_part.reason})")

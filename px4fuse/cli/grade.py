@@ -118,11 +118,17 @@ def grade(
     rubric: Path | None,
     key: Path | None,
     output: Path | None,
+    title: str | None,
     roster: Path | None,
     due_time_text: str | None,
     late_rule_text: str | None,
+    grace: float,
+    questions: int | None,
+    worksheet: tuple[Path, ...],
+    column: str | None,
+    jobs: int | None,
     write_rubric: Path | None,
-    **option_values: Any,
+    **other_settings: Any,
 ) -> None:
     """Verify and grade the reports of a class.
 
@@ -143,40 +149,40 @@ def grade(
         return
     if late_rule_text and due_time_text is None:
         raise SettingsError("--late requires --due TIME.")
-    question_count, process_count = option_values.pop("questions") or 0, option_values.pop("jobs")
-    if question_count and key is None:
+    if questions and key is None:
         raise SettingsError("--questions requires --key FILE.json.")
     if not submissions:
         raise SettingsError("no submissions were given. Give PDFs, folders or zip files.")
     if output is None:
         raise SettingsError("px4fuse grade requires an output folder: -o DIR.")
-    _require_output_outside(output, (*submissions, *logs))
+    _protect_inputs_from_output((*submissions, *logs), output)
     course = Course(
         read_rubric(rubric),
         None if key is None else read_answer_key(key),
         logs,
-        option_values.pop("title") or "",
+        title or "",
         roster=None if roster is None else read_people(read_csv_sheet(roster)),
-        worksheets=tuple(map(read_csv_sheet, option_values.pop("worksheet"))),
-        grade_column_title=option_values.pop("column") or "",
+        worksheets=tuple(map(read_csv_sheet, worksheet)),
+        grade_column_title=column or "",
         due=parse_due_time(due_time_text) if due_time_text else None,
+        grace_period_s=60.0 * grace,
+        question_count=questions or 0,
         late_rule=parse_late_rule(late_rule_text) if late_rule_text else None,
-        grace_period_s=60.0 * option_values.pop("grace"),
-        question_count=question_count,
-        **option_values,
+        **other_settings,  # attempt, scale, include_pending and anonymous
     )
     with folder_progress(output) as show_progress:
         outcome = grade_submissions(
             submissions,
             course,
             output,
-            processes=process_count,
+            processes=jobs,
             progress=partial(show_progress, "grading"),
         )
     write_and_print_results({}, grading_page(outcome), written_files=outcome.written_paths)
 
 
-def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None:
+def _protect_inputs_from_output(input_paths: tuple[Path, ...], output: Path) -> None:
+    """Register all input files, and check that the output folder is not inside an input folder."""
     resolved_path = output.resolve()
     output_and_parents = [
         folder for folder in (resolved_path, *resolved_path.parents) if folder.is_dir()

@@ -23,11 +23,8 @@ def _print_versions(context: click.Context, _: click.Parameter, is_requested: bo
     from px4fuse.results.model import provenance
 
     versions = provenance("")
-    library_versions = ", ".join(
-        f"{name} {version}" for name, version in versions.libraries.items()
-    )
     click.echo(f"px4fuse {versions.px4fuse}, Python {versions.python}, {platform.platform()}")
-    click.echo(library_versions)
+    click.echo(", ".join(map(" ".join, versions.libraries.items())))
     context.exit()
 
 

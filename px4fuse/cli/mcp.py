@@ -124,18 +124,20 @@ def run_command(
     """
     readable_folders.set(folders)
     max_log_bytes.set(max_bytes)
-    # Only worker processes have a sender, and only worker processes write files: the folder of the
-    # server process does not change
+    # reports are written to reports/ in the current folder. A sender exists only in a worker
+    # process; commands in the server process write no files
     if report_folder and sender:
         os.chdir(report_folder)
     output, results_json_texts = io.StringIO(), list[str]()
     try:
         with redirect_stdout(output), redirect_stderr(io.StringIO()):
-            # without a folder, the results go to standard output ("-"), and no report is written
+            # without a folder, the default of --json is standard output ("-"), so that the command
+            # writes no report
             default_options = {command_words[0]: {"json_path": None if report_folder else "-"}}
             with cli.make_context(
                 "px4fuse", [*command_words], default_map=default_options
             ) as context:
+                # progress() sends messages, and make_result_files() adds the results to the list
                 context.meta[outputs.SEND_PROGRESS_KEY] = sender and sender.send
                 context.meta[outputs.RESULTS_KEY] = results_json_texts
                 cli.invoke(context)

@@ -42,14 +42,15 @@ if TYPE_CHECKING:
     from px4fuse.results.model import Student
 
 
-OptionDecorator = Callable[[Callable[..., None]], Callable[..., None]]
+CommandFunction = Callable[..., None]
+OptionDecorator = Callable[[CommandFunction], CommandFunction]
 Choice = partial(click.Choice, case_sensitive=False)
 
 
 def _combine_options(*options: OptionDecorator) -> OptionDecorator:
     """Combine options into one decorator; --help lists them in this order."""
 
-    def add_options(command: Callable[..., None]) -> Callable[..., None]:
+    def add_options(command: CommandFunction) -> CommandFunction:
         for option in reversed(options):
             command = option(command)
         return command
@@ -235,10 +236,11 @@ def request_option(
     RANGE in ``help_text`` is replaced by the range of the KF setting. ``details`` are arguments of
     ``click.option``.
     """
-    field = next(field for field in structs.fields(request_type) if field.name == name)
+    field = {field.name: field for field in structs.fields(request_type)}[name]
+    # the type, and its members if it is a union such as ``float | Literal["auto"] | None``
     types = (field.type, *get_args(field.type))
     literal_types = [each for each in types if get_origin(each) is Literal]
-    if float in types:
+    if float in types:  # the only word instead of a number is "auto"
         units = (unit for suffix, unit in UNIT_BY_SUFFIX.items() if name.endswith(suffix))
         details["type"] = NumberWithUnit(next(units, ""), accepts_auto=bool(literal_types))
     elif literal_types:
@@ -366,13 +368,14 @@ def comparison_request(log: Path, option_values: dict[str, Any]) -> ComparisonRe
     SettingsError
         An option for a position file is given without --position.
     """
-    return ComparisonRequest(
-        log=str(log), position=_parse_position_file(option_values), **option_values
-    )
+    position = _remove_position_file(option_values)
+    return ComparisonRequest(log=str(log), position=position, **option_values)
 
 
-def _parse_position_file(option_values: dict[str, Any]) -> PositionFile | None:
+def _remove_position_file(option_values: dict[str, Any]) -> PositionFile | None:
+    """Remove the values of ``position_options`` from ``option_values``; return the file."""
     option_names = OPTION_NAMES[PositionFile]
+    # click names the parameter of --position-frame position_frame
     fields = {
         field: option_values.pop(name[2:].replace("-", "_")) for field, name in option_names.items()
     }

@@ -29,8 +29,7 @@ if TYPE_CHECKING:
 
 # Maximum length (bytes) of a default report name, and length to which a longer name is cut
 MAX_NAME_BYTES, SHORTENED_NAME_BYTES = 200, 180
-# Empty name and id, for a report without a student
-NO_STUDENT_NAME = ("", "")
+
 # Line width (characters) in a pipe: longer than any paragraph
 LINE_WIDTH_OF_PIPED_OUTPUT = 10_000
 # Key in the click context: paths of the files that the command has written
@@ -180,21 +179,20 @@ def _is_same_report(
     An existing report without a student is also accepted.
     """
     from px4fuse.results.contract import find_file_hashes, to_json
+    from px4fuse.results.model import NO_STUDENT
 
     existing_results = read(existing_content, "report")
     # Sets, because answers of a student repeat the hash of the log
     existing_hashes, new_hashes = (
         set(find_file_hashes(to_json(results))) for results in (existing_results, new_results)
     )
-    return existing_hashes == new_hashes and _get_student_name_and_id(existing_results) in (
-        NO_STUDENT_NAME,
-        _get_student_name_and_id(new_results),
+    existing_student, new_student = (
+        getattr(results, "student", NO_STUDENT) for results in (existing_results, new_results)
     )
-
-
-def _get_student_name_and_id(results: Results) -> tuple[str, str]:
-    student = getattr(results, "student", None)
-    return NO_STUDENT_NAME if student is None else (student.name, student.id)
+    return existing_hashes == new_hashes and (existing_student.name, existing_student.id) in (
+        ("", ""),
+        (new_student.name, new_student.id),
+    )
 
 
 def choose_web_page_path(output: Path | None, default: Path) -> Path:
@@ -247,6 +245,7 @@ def make_result_files(
     """
     from px4fuse.results.contract import to_json
 
+    # before the next step: px4fuse mcp sets --json - if no report may be written
     if default_stem and output is None and json_path is None:
         output = choose_default_report_path(default_stem, results)
     json_text, contents = to_json(results), dict[Path, bytes]()
@@ -258,12 +257,11 @@ def make_result_files(
         from px4fuse.report.pdf import render_pdf
 
         show_progress("writing the report")
-        output, results_path = choose_report_paths(output, json_path)
-        contents |= {
-            output: render_pdf(analysis, results, json_text),
-            results_path: json_text.encode(),
-        }
-    if json_path is not None:
+        # the results beside the report, or in the file of --json
+        _, results_path = choose_report_paths(output, json_path)
+        contents[output] = render_pdf(analysis, results, json_text)
+        contents[results_path] = json_text.encode()
+    if json_path is not None:  # a file, or in addition standard output
         contents[json_path] = json_text.encode()
     return contents
 

@@ -1,6 +1,5 @@
 """Command ``px4fuse simulate``: simulates flights with ground truth and injected faults."""
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, get_args
@@ -22,6 +21,7 @@ from px4fuse.simulation.scenario import (
 
 from .options import (
     Choice,
+    CommandFunction,
     NonEmptyPath,
     NumberWithUnit,
     flag_option,
@@ -47,7 +47,7 @@ ASSIGNMENT_OPTIONS = (
 MAX_SECRET_BYTES = 10_000
 
 
-def _add_scenario_options(command: Callable[..., None]) -> Callable[..., None]:
+def _add_scenario_options(command: CommandFunction) -> CommandFunction:
     """Add a command-line option for each numeric field of Scenario."""
     for field, quantity in reversed(collect_field_bounds(Scenario).items()):
         if not quantity.help_or_placeholder:

@@ -31,8 +31,7 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
 
     request = comparison_request(log, option_values)
     with progress(json_path) as show_progress:
-        flight = read_flight(request, show_progress)
-        comparison = prepare_comparison(flight, request, show_progress)
+        comparison = prepare_comparison(read_flight(request, show_progress), request, show_progress)
         _, time_offset = estimate_noises_and_time_offset(comparison, show_progress)
         rerun = None
         if not isinstance(time_offset, Unavailable) and time_offset.is_significant(
@@ -41,10 +40,10 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
             rerun = rerun_kf_with_time_offset(comparison, time_offset)
     advice = make_time_offset_advice(comparison, time_offset, rerun)
     if isinstance(time_offset, Unavailable) or not time_offset.is_determinable:
-        log_name = comparison.flight.log.name
         remedy = time_offset.remedy if isinstance(time_offset, Unavailable) else advice["Action"]
         raise MissingDataError(
-            f"{log_name}: the time offset cannot be estimated: {time_offset.reason}",
+            f"{comparison.flight.log.name}: the time offset cannot be estimated: "
+            f"{time_offset.reason}",
             remedy,
         )
     results = make_sync_results(request, comparison, time_offset)

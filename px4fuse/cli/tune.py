@@ -29,8 +29,7 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
 
     request = comparison_request(log, option_values)
     with progress(json_path) as show_progress:
-        flight = read_flight(request, show_progress)
-        comparison = prepare_comparison(flight, request, show_progress)
+        comparison = prepare_comparison(read_flight(request, show_progress), request, show_progress)
         tunings = estimate_noises(comparison, progress=show_progress)
     unavailable = [tuning for tuning in tunings.values() if isinstance(tuning, Unavailable)]
     if len(unavailable) == len(tunings):

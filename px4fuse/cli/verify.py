@@ -45,10 +45,11 @@ def verify(
     from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_report
     from px4fuse.verification.verification import verify as verify_report
 
+    name = display_name(report)
     content = read_bytes_limited(
         report, LogError, MAX_PDF_BYTES, remedy_if_too_large="Give a PDF report that px4fuse wrote."
     )
-    recorded_results = read_report(content, display_name(report))
+    recorded_results = read_report(content, name)
     with progress(json_path) as show_progress:
         show_progress("computing the SHA-256 of the logs")
         file_by_sha256 = hash_files(logs)
@@ -64,12 +65,12 @@ def verify(
             ANALYSIS_TIMEOUT_S,
         )
     if isinstance(verification, JobFailure):
-        raise LogError(f"{display_name(report)} cannot be verified: {verification.reason}")
+        raise LogError(f"{name} cannot be verified: {verification.reason}")
     pdf_by_path = (
         {} if output is None or not verification.redrawn_pdf else {output: verification.redrawn_pdf}
     )
     contents = pdf_by_path | make_result_files(
         make_verification_output(content, verification), json_path
     )
-    write_and_print_results(contents, verification_page(display_name(report), verification, output))
+    write_and_print_results(contents, verification_page(name, verification, output))
     sys.exit(0 if verification.outcome == "verified" else 1)

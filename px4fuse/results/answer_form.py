@@ -308,17 +308,20 @@ def read_answers(path: Path) -> Answers:
 def _describe_error(error: Exception, form_toml: str, form_values: dict[str, Any]) -> str:
     """Describe an invalid answer and the accepted answers, or a line that is not TOML."""
     message = str(error)
+    # error of tomllib
     if line_match := re.search(r"\(at line (\d+), column \d+\)", message):
         line = line_match[1]
         content = shorten_to_line(form_toml.splitlines()[int(line) - 1], 60)
         return f"line {line} ({content}) is not valid; give {NUMBER_HELP}, or a word in quotes"
+    # error of msgspec, such as "Expected `str`, got `int` - at `$.mistakes[0].kind`"
     reason, _, path = message.partition(" - at `$.")
     names = re.findall(r"\w+", path)
-    if not names:
+    if not names:  # error of check_answers
         return message
     invalid_value: Any = form_values
     for name in names:
         invalid_value = invalid_value[int(name) if name.isdigit() else name]
+    # name of the answer in the form
     label = names[0]
     match names:
         case ["mistakes", index]:
@@ -338,6 +341,7 @@ def _describe_error(error: Exception, form_toml: str, form_values: dict[str, Any
 def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
     """Convert the tables of a form to the fields of :class:`Answers`."""
     filled_form = _remove_empty_values(form)
+    # the form has tables [[mistake]], [quantities] (q1, q2, q3) and [choices] (c1, c2, ...)
     mistakes = filled_form.pop("mistake", ())
     quantities, choices = (
         msgspec.convert(filled_form.pop(name, {}), dict[str, Any])
@@ -345,6 +349,7 @@ def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
     )
     quantity_fields = [f"q{number}" for number in range(1, len(_QUESTION_KIND_PAIRS) + 1)]
     choice_fields = [f"c{number}" for number in range(1, MAX_CHOICES + 1)]
+    # msgspec finds all other unknown fields
     unknown_fields = (quantities.keys() - quantity_fields) | (choices.keys() - choice_fields)
     if "mistakes" in filled_form:
         # Answers has a field "mistakes", but in a form only "mistake" is valid
@@ -386,14 +391,15 @@ def check_answers(answers: Answers) -> None:
         if kinds.count(kind) > 1:
             raise ValueError(f"the form names {kind!r} twice; name each kind of fault once")
         fault_kind = FAULT_KINDS[kind]
-        for field_name, allowed_answers in (
-            ("parameter", UNITS_BY_CORRECTION),
-            ("panel", REPORT_PANELS),
-            ("unit", fault_kind.units),
-            ("value_unit", UNITS_BY_CORRECTION.get(named_fault.parameter)),
+        # without a parameter, the value is not used, so any unit is allowed
+        value_unit = named_fault.value_unit if named_fault.parameter else ""
+        for field_name, answer, allowed_answers in (
+            ("parameter", named_fault.parameter, UNITS_BY_CORRECTION),
+            ("panel", named_fault.panel, REPORT_PANELS),
+            ("unit", named_fault.unit, fault_kind.units),
+            ("value_unit", value_unit, UNITS_BY_CORRECTION.get(named_fault.parameter, ())),
         ):
-            answer = getattr(named_fault, field_name)
-            if answer and allowed_answers is not None:
+            if answer:
                 _require_allowed_answer(f"{kind}: {field_name}", answer, allowed_answers)
         size = named_fault.convert_size_to_standard_unit()
         if size is not None and not fault_kind.min_size <= size <= fault_kind.max_size:

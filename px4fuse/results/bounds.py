@@ -106,6 +106,8 @@ def _drop_invalid_values(
         if isinstance(value, float):
             _require_valid_number(value, path)
     except _OutOfBoundsError as error:
+        # the value is a record with an invalid number: replace the record by the reason, if its
+        # field allows this
         for unavailable_type in list_types(annotation):
             if isinstance(unavailable_type, type) and issubclass(unavailable_type, Unavailable):
                 text_fields = {"what": path, "reason": error.reason, "remedy": CHECK_LOG_REMEDY}
@@ -119,6 +121,7 @@ def _drop_invalid_values(
                     if field.name not in text_fields and hasattr(value, field.name)
                 }
                 return unavailable_type(**text_fields, **other_fields)
+        # otherwise, the caller removes the value
         raise
     return value
 
@@ -136,13 +139,13 @@ def _drop_invalid_fields(
 ) -> msgspec.Struct:
     changes: dict[str, Any] = {}
     for field in fields(value):
-        if field.type is msgspec.UnsetType:
+        if field.type is msgspec.UnsetType:  # not in the JSON results, for example an array
             continue
         field_value, field_path = getattr(value, field.name), f"{path}.{field.name}".lstrip(".")
         try:
             changes[field.name] = _drop_invalid_values(field_value, field.type, field_path, errors)
         except _OutOfBoundsError as error:
-            if field.default is not None:
+            if field.default is not None:  # only fields with the default None may be missing
                 raise
             errors.append(error)
             changes[field.name] = None
@@ -160,10 +163,10 @@ def _drop_invalid_entries(
             )
         except _OutOfBoundsError as error:
             errors.append(error)
-    # if all entries are invalid, a mapping that must not be empty, such as the axes, is invalid too
-    if not checked_elements and any(
-        getattr(meta, "min_length", 0) for meta in get_args(annotation)[1:]
-    ):
+    # a mapping that must not be empty (Meta(min_length=1)), such as the axes, is not valid as a
+    # whole
+    metadata = get_args(annotation)[1:]
+    if value and not checked_elements and any(getattr(meta, "min_length", 0) for meta in metadata):
         raise errors[-1]
     return checked_elements
 

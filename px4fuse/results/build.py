@@ -52,7 +52,9 @@ def make_results(results_type: type[ResultsT], command: str, **fields: Any) -> R
     )
     return drop_invalid_numbers(
         results_type(
-            schema=Schema(schema_name, SCHEMA_VERSION), provenance=provenance(command), **fields
+            schema=Schema(schema_name, SCHEMA_VERSION),
+            provenance=provenance(command),
+            **fields,
         )
     )
 
@@ -112,12 +114,11 @@ def make_tuning_results(
     comparison: PreparedComparison,
     tuning_by_axis: Mapping[str, AxisTuning | Unavailable],
 ) -> contract.TuningResults:
-    fields = _make_flight_fields(request, comparison)
     return make_results(
         contract.TuningResults,
         command_line(request, "tune"),
         tuning=dict(tuning_by_axis),
-        **fields,
+        **_make_flight_fields(request, comparison),
     )
 
 
@@ -126,27 +127,27 @@ def make_sync_results(
     comparison: PreparedComparison,
     time_offset: SourceTimeOffset | Unavailable,
 ) -> contract.SyncResults:
-    fields = _make_flight_fields(request, comparison)
     return make_results(
-        contract.SyncResults, command_line(request, "sync"), clock=time_offset, **fields
+        contract.SyncResults,
+        command_line(request, "sync"),
+        clock=time_offset,
+        **_make_flight_fields(request, comparison),
     )
 
 
 def make_whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> contract.WhatIfResults:
-    summaries, sweep_start_index = analysis.statistics, analysis.sweep_start_index
+    sweep_start_index = analysis.sweep_start_index
+    fields = dict(vars(analysis.statistics))
+    replays = fields.pop("whatif")
     return make_results(
         contract.WhatIfResults,
         command_line(request),
         request=request.with_file_names(),
         log=make_log_record(analysis.flight),
-        agreement=summaries.agreement,
-        evaluated_s=summaries.evaluated_s,
         uses_estimates=analysis.uses_estimates,
-        logged=summaries.logged,
-        replayed=summaries.replayed,
-        whatif=summaries.whatif[0] if sweep_start_index else None,
-        sweep=summaries.whatif[sweep_start_index:],
-        notes=summaries.notes,
+        whatif=replays[0] if sweep_start_index else None,
+        sweep=replays[sweep_start_index:],
+        **fields,
     )
 
 

@@ -120,10 +120,6 @@ class ChosenSettings(Record, kw_only=True):
     clock_offset_s: float
 
 
-# Field of AxisTuning that contains the maximum-likelihood estimate of a KF setting
-ESTIMATE_FIELD_BY_SETTING = {"sigma_a_m_s2": "sigma_a_two_state_m_s2", "sigma_z_m": "sigma_z_m"}
-
-
 DiffInputName = Literal["A", "B"]
 # 95 % interval; the upper bound is None if the data do not limit it
 ConfidenceInterval = tuple[float, float | None]
@@ -381,6 +377,7 @@ def schema() -> dict[str, Any]:
 
 def make_schemas_of_types(types: Collection[type]) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Return the JSON Schema of each type, and the definitions (``$defs``) that they use."""
+    # all types with a definition: ``types``, and the members of unions in their fields
     record_types = dict.fromkeys(types)
     schemas: tuple[dict[str, Any], ...] = ()
     components: dict[str, Any] = {}
@@ -395,7 +392,7 @@ def make_schemas_of_types(types: Collection[type]) -> tuple[list[dict[str, Any]]
         }
 
     count = 0
-    # repeat, because `describe_union` finds nested types
+    # repeat until `describe_union`, which msgspec calls for each union, finds no new types
     while count < len(record_types):
         count = len(record_types)
         schemas, components = msgspec.json.schema_components(

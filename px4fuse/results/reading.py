@@ -71,9 +71,10 @@ def _remove_unknown_fields(value: Any, annotation: Any) -> Any:
     """Remove fields that are unknown to this version from decoded JSON."""
     types = list_types(annotation)
     if isinstance(value, dict):
-        # a union may contain several records, such as a result and Unavailable
+        # a union may contain several records, such as a result and Unavailable: keep the fields of
+        # all of them, because the type of this record is not known yet
         record_types = [each for each in types if hasattr(each, "__struct_fields__")]
-        if not record_types:
+        if not record_types:  # a mapping
             value_type = find_value_type(annotation)
             return {key: _remove_unknown_fields(child, value_type) for key, child in value.items()}
         field_types = {
@@ -87,6 +88,7 @@ def _remove_unknown_fields(value: Any, annotation: Any) -> Any:
             if key in field_types
         }
     if isinstance(value, list):
+        # X of ``tuple[X, ...]``; a union contains at most one type of tuple
         item_type = next((args[0] for args in map(get_args, types) if args), Any)
         return [_remove_unknown_fields(element, item_type) for element in value]
     return value

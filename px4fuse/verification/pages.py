@@ -175,6 +175,7 @@ class _PdfComparison:
             self.fonts = resolve_reference(redrawn_page.get_object()["/Resources"].get("/Font", {}))
             for difference in self._compare((submitted_page, redrawn_page, "/Page")):
                 yield PageDifference(page_number, *difference)
+        # the comparison of pages and of these pairs may append further pairs
         for pair in self.deferred_pairs:
             for difference in self._compare(pair):
                 yield PageDifference(0, *difference)
@@ -184,6 +185,8 @@ class _PdfComparison:
 
     def _compare(self, pair: _ValuePair) -> Iterator[_PdfDifference]:
         """Yield the differences of two PDF values, including nested values."""
+        # a stack instead of recursion: lists and dictionaries add the pairs of their elements, the
+        # last element first, and the loop compares the newest pair
         self.pairs_to_compare = [pair]
         while self.pairs_to_compare:
             submitted_value, redrawn_value, key = self.pairs_to_compare.pop()
@@ -195,6 +198,7 @@ class _PdfComparison:
                     # programs that ignore generation numbers would display another object
                     yield f"another program changed the PDF entry {key}", _STRUCTURAL
                 if isinstance(redrawn_value, IndirectObject):
+                    # objects may refer to each other in a cycle, so each pair is compared once
                     object_ids = (
                         submitted_value.idnum,
                         submitted_value.generation,
@@ -307,10 +311,9 @@ class _PdfComparison:
         for number, (submitted, redrawn) in enumerate(
             zip_longest(*operation_lists, fillvalue=("", ())), start=1
         ):
-            (submitted_operator, submitted_operands), (redrawn_operator, redrawn_operands) = (
-                submitted,
-                redrawn,
-            )
+            submitted_operator, submitted_operands = submitted
+            redrawn_operator, redrawn_operands = redrawn
+            # Tf selects the font of the next texts
             if redrawn_operator == "Tf":
                 font_name = str(redrawn_operands[0])
             if _is_same_operation(submitted, redrawn):
@@ -320,8 +323,10 @@ class _PdfComparison:
                 return f"PDF drawing operation {number} ({operator_text}) was changed"
             submitted_text = self._decode_text(submitted_operands, font_name)
             redrawn_text = self._decode_text(redrawn_operands, font_name)
+            # numbers between the parts of a text move the next part
             kerning = [abs(value) for value in submitted_operands if isinstance(value, float)]
-            # if the texts are equal, only the kerning was changed
+            # tolerate only a text with another last digit of a number. If the texts are equal, the
+            # operations differ in the kerning
             if (
                 submitted_text == redrawn_text
                 or max(kerning, default=0.0) >= MAX_KERNING_PER_MILLE_EM
@@ -353,12 +358,15 @@ def _find_ambiguities(pdf: bytes) -> Iterator[PageDifference]:
     """Yield each file structure that PDF programs may interpret differently."""
     end_match = _END_OF_FILE_PATTERN.search(pdf[-1024:])
     if end_match is None:
-        yield PageDifference(0, "the file has bytes after the end of the PDF", True)
+        yield PageDifference(0, "the file has bytes after the end of the PDF", _STRUCTURAL)
     elif b"/Linearized" in pdf[:1024]:
-        # a second cross-reference table could replace pages
-        xref_table_start = pdf.find(b"endobj") + len(b"endobj")
-        if pdf[xref_table_start : int(end_match[1])].strip():
-            yield PageDifference(0, SECOND_XREF_TABLE_REASON, True)
+        # in a linearised PDF (ISO 32000-1, annex F), the cross-reference table follows the first
+        # object, and the end of the file states its position ("startxref"). If both positions
+        # differ, there are two tables, and the second could replace pages
+        first_object_end = pdf.find(b"endobj") + len(b"endobj")
+        stated_xref_table_start = int(end_match[1])
+        if pdf[first_object_end:stated_xref_table_start].strip():
+            yield PageDifference(0, SECOND_XREF_TABLE_REASON, _STRUCTURAL)
 
 
 def _get_page_references(reader: pypdf.PdfReader) -> list[Any]:

@@ -170,9 +170,13 @@ def _estimate_inflated_size_bytes(pdf: bytes, start: int, limit_bytes: int) -> i
     ):
         return 0  # not zlib data (RFC 1950, section 2.2)
     decompressor = zlib.decompressobj()
+    # decompress at most 1 MB per step until the end of the data or the limit. The input is limited
+    # too, because reading needs time even if the output is empty
     input_bytes = output_bytes = 0
     while not decompressor.eof and max(input_bytes, output_bytes) <= limit_bytes:
-        if not (chunk := decompressor.unconsumed_tail):
+        # input that the last step has not read because of its limit, otherwise new input
+        chunk = decompressor.unconsumed_tail
+        if not chunk:
             chunk = pdf[start + input_bytes : start + input_bytes + 16_384]
             input_bytes += len(chunk)
         if not chunk:
@@ -182,6 +186,7 @@ def _estimate_inflated_size_bytes(pdf: bytes, start: int, limit_bytes: int) -> i
         except zlib.error:
             # pypdf will reject this damaged stream
             break
+    # bytes after the end of the data
     input_bytes -= len(decompressor.unused_data)
     # count at least 1000 bytes for each stream, because each start of the decompression needs time
     return min(max(input_bytes, output_bytes, 1000), limit_bytes + 1)
@@ -264,9 +269,42 @@ def _read_pdf_name_object(value: object) -> str | None:
 
 def _read_attachment(reader: pypdf.PdfReader) -> bytes:
     """Return the content of the attached file RESULTS_NAME; other attachments are an error."""
-    # a file specification refers to the stream of the file with /EF. Streams of the type
-    # /EmbeddedFile without file specification are found too: each stream once, by its identity
+    file_specifications, streams = _find_attachments(reader)
+    if not file_specifications and not streams:
+        raise ResultsError(
+            f"No {RESULTS_NAME} is attached to this PDF. It is not a px4fuse report, or was "
+            "printed to PDF. Hand in the original file."
+        )
+    if len(file_specifications) != 1 or len(streams) != 1:
+        raise ResultsError(
+            "The PDF has several attachments, or an unreadable one. Hand in one report per PDF."
+        )
+    # PDF programs may read any of these names
+    file_name_keys = {"/UF", "/F", "/DOS", "/Mac", "/Unix"} & file_specifications[0].keys()
+    file_names = {str(resolve_reference(file_specifications[0].get(key))) for key in file_name_keys}
+    if file_names != {RESULTS_NAME}:
+        name_text = shorten_to_line(" / ".join(sorted(file_names)), 80)
+        raise ResultsError(f"the name of the attached file is {name_text!r}, not {RESULTS_NAME!r}.")
+    attached_bytes = bytes(streams[0].get_data())
+    if len(attached_bytes) > MAX_ATTACHMENT_BYTES:
+        limit_mb = MAX_ATTACHMENT_BYTES // 1_000_000
+        raise ResultsError(f"the attached {RESULTS_NAME} is larger than {limit_mb} MB.")
+    return attached_bytes
+
+
+def _find_attachments(reader: pypdf.PdfReader) -> tuple[list[DictionaryObject], list[Any]]:
+    """Return the file specifications and the streams of all attached files.
+
+    A file specification refers to the stream of the file with /EF. Streams of the type
+    /EmbeddedFile without file specification are found too.
+
+    Raises
+    ------
+    ResultsError
+        The PDF contains features that px4fuse never writes.
+    """
     file_specifications: list[DictionaryObject] = []
+    # by identity, so that each stream is listed once
     streams: dict[int, Any] = {}
     unexpected_features: set[str] = set()
     for dictionary, runs_only_after_click in _walk_dictionaries(reader):
@@ -280,23 +318,4 @@ def _read_attachment(reader: pypdf.PdfReader) -> bytes:
     if unexpected_features:
         feature_names_text = ", ".join(sorted(unexpected_features))
         raise ResultsError(f"the PDF contains {feature_names_text}, which px4fuse never writes.")
-    if not file_specifications and not streams:
-        raise ResultsError(
-            f"No {RESULTS_NAME} is attached to this PDF. It is not a px4fuse report, or was "
-            "printed to PDF. Hand in the original file."
-        )
-    if len(file_specifications) != 1 or len(streams) != 1:
-        raise ResultsError(
-            "The PDF has several attachments, or an unreadable one. Hand in one report per PDF."
-        )
-    (file_specification,), (stream,) = file_specifications, streams.values()
-    file_name_keys = {"/UF", "/F", "/DOS", "/Mac", "/Unix"} & file_specification.keys()
-    file_names = {str(resolve_reference(file_specification.get(key))) for key in file_name_keys}
-    if file_names != {RESULTS_NAME}:
-        name_text = shorten_to_line(" / ".join(sorted(file_names)), 80)
-        raise ResultsError(f"the name of the attached file is {name_text!r}, not {RESULTS_NAME!r}.")
-    attached_bytes = bytes(stream.get_data())
-    if len(attached_bytes) > MAX_ATTACHMENT_BYTES:
-        limit_mb = MAX_ATTACHMENT_BYTES // 1_000_000
-        raise ResultsError(f"the attached {RESULTS_NAME} is larger than {limit_mb} MB.")
-    return attached_bytes
+    return file_specifications, [*streams.values()]

@@ -80,6 +80,8 @@ RESULT_TO_PRINTED_UNIT_FACTORS = (1.0, 100.0, 1000.0)
 MAX_NOTES_LINES = 5_000
 _NUMBER_PATTERN = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
+# Logs and other input files
+PathBySha256 = Mapping[str, Path]
 # Results of the new analysis, and a function that draws the PDF of these results
 RecomputedReport = tuple[ReportedResults, Callable[[], bytes]]
 # Function that links an input file into a temporary folder and returns the path of the link;
@@ -96,7 +98,7 @@ def log_sha256(results: ReportedResults) -> str:
 
 
 def recompute_report(
-    results: ReportedResults, path_by_sha256: Mapping[str, Path]
+    results: ReportedResults, path_by_sha256: PathBySha256
 ) -> RecomputedReport | Verification:
     """Repeat the analysis of a submitted report with the settings in its ``results``.
 
@@ -124,7 +126,7 @@ def recompute_report(
 
 
 def _link_input_file(
-    path_by_sha256: Mapping[str, Path], folder: Path, name: str, sha256: str | None, file_label: str
+    path_by_sha256: PathBySha256, folder: Path, name: str, sha256: str | None, file_label: str
 ) -> str:
     """Link the file with this SHA-256 into a temporary folder, and return the path of the link.
 
@@ -213,9 +215,7 @@ def _draw_report(
 # ------------------------------------------------------------------ the verdict
 
 
-def verify(
-    results: ReportedResults, pdf: bytes, path_by_sha256: Mapping[str, Path]
-) -> Verification:
+def verify(results: ReportedResults, pdf: bytes, path_by_sha256: PathBySha256) -> Verification:
     """Verify a report: repeat its analysis, draw it again, and compare numbers and pages.
 
     Parameters
@@ -298,35 +298,30 @@ def _compare_with_new_report(
     page_reasons = [each.sentence for each in page_differences[:MAX_LISTED_PAGE_DIFFERENCES]]
     if (unlisted_count := len(page_differences) - MAX_LISTED_PAGE_DIFFERENCES) > 0:
         page_reasons.append(f"{unlisted_count} further differences are not listed")
-    # another PDF program or other library versions may change pages without a forgery
-    is_from_other_program = any(difference.is_structural for difference in page_differences)
-    other_libraries: set[tuple[str, str]] = set()
-    if page_differences:
-        submitted_libraries = submitted_results.provenance.libraries.items()
-        other_libraries = submitted_libraries - new_results.provenance.libraries.items()
     page_status: PageStatus = "differ" if page_differences else "same"
-    if is_from_other_program or other_libraries:
+    remedy, library_reasons = "", []
+    # other library versions or another PDF program may change pages without a forgery
+    submitted_libraries = submitted_results.provenance.libraries.items()
+    other_libraries = submitted_libraries - new_results.provenance.libraries.items()
+    if page_differences and other_libraries:
         page_status = "not compared"
-    status: VerificationStatus = "verified"
-    reasons = [values_reason, *page_reasons]
-    if mismatches:
-        status = "numbers differ"
-    elif page_status == "not compared":
-        status = "cannot verify"
-        # the reasons for this status are first, because some tables show only one reason
-        reasons = [*page_reasons, values_reason]
-    remedy = ""
-    if other_libraries:
         versions_text = shorten_to_line(", ".join(map(" ".join, sorted(other_libraries))), 300)
-        reasons.append(
+        library_reasons.append(
             f"the report was made with {versions_text}; this computer has other versions, so "
             "pages may look different"
         )
         remedy = f"Verify the report with {versions_text}."
-    if is_from_other_program:
-        remedy = ORIGINAL_PDF_REMEDY
-    if status == "verified":
-        reasons.append(VERIFICATION_SCOPE_NOTE)
+    if any(difference.is_structural for difference in page_differences):
+        page_status, remedy = "not compared", ORIGINAL_PDF_REMEDY
+    # the decisive reason is first: some tables show only one reason
+    status: VerificationStatus = "verified"
+    reasons = [values_reason, *page_reasons, VERIFICATION_SCOPE_NOTE]
+    if mismatches:
+        status = "numbers differ"
+        reasons = [values_reason, *page_reasons, *library_reasons]
+    elif page_status == "not compared":
+        status = "cannot verify"
+        reasons = [*page_reasons, values_reason, *library_reasons]
     return Verification(
         status,
         tuple(reasons),
@@ -376,6 +371,7 @@ def compare_results(
     # with estimated settings, all numbers depend on maximum-likelihood estimates
     has_estimated_settings = not {"auto", "--position"}.isdisjoint(command.split())
     recorded_values, new_values = dict(flatten(recorded_results)), dict(flatten(new_results))
+    # value in the report and value in the new analysis; one of them may lack a value
     value_pair_by_path = {
         path: (recorded_values.get(path, _ABSENT), new_values.get(path, _ABSENT))
         for path in {**new_values, **recorded_values}
@@ -387,6 +383,7 @@ def compare_results(
             non_number_paths.append(path)
             continue
         is_estimated = has_estimated_settings or path.startswith(ESTIMATE_FIELDS)
+        # numbers agree within a tolerance, and may be equal
         if not _is_within_tolerance(path, recorded_value, new_value, is_estimated):
             mismatched_paths.append(path)
         elif recorded_value != new_value:
@@ -435,8 +432,10 @@ def is_number(value: object) -> bool:
 def _is_within_tolerance(
     path: str, submitted_number: float, new_number: float, is_estimated: bool
 ) -> bool:
-    if isinstance(new_number, int):
-        tolerance: float = MAX_SOLVER_ITERATION_DIFFERENCE * path.endswith(ITERATIONS_FIELD)
+    tolerance = 0.0
+    if isinstance(new_number, int):  # counts must be equal, except the iterations of a solver
+        if path.endswith(ITERATIONS_FIELD):
+            tolerance = MAX_SOLVER_ITERATION_DIFFERENCE
     elif is_estimated:
         tolerance = ESTIMATE_RELATIVE_TOLERANCE * abs(new_number) + ESTIMATE_ABSOLUTE_TOLERANCE
     else:

@@ -56,9 +56,9 @@ def guess_choices(rng: np.random.Generator, one: CorrectFormAnswers) -> tuple[st
     letters, count = [], len(QUESTIONS)
     for first in range(0, len(one.choices), count):
         guess = rng.choice(one.choices[first][0].options)
-        fault = next(each for each in FIGURE_ANSWERS_BY_FAULT.values() if each.fault == guess)
+        fault = next(each for each in FIGURE_ANSWERS_BY_FAULT.values() if each["fault"] == guess)
         for (choice, _), field in zip(one.choices[first : first + count], QUESTIONS, strict=True):
-            letters.append(CHOICE_LETTERS[choice.options.index(getattr(fault, field))])
+            letters.append(CHOICE_LETTERS[choice.options.index(fault[field])])
     return tuple(letters)
 
 

@@ -25,6 +25,7 @@ from .key import (
     read_answer_key,
 )
 from .random_assignment import (
+    DrawRandomNumber,
     FlightKind,
     assign_random_flight,
     derive_hmac_key,
@@ -125,8 +126,11 @@ def write_assignment(
     OutputError
         A file exists with other content, or cannot be written.
     """
-    with protect_inputs(is_active=False):
-        key = read_answer_key(key_file) if key_file.exists() else AnswerKey(kind, ())
+    # add the students to an existing answer key
+    key = AnswerKey(kind, ())
+    if key_file.exists():
+        with protect_inputs(is_active=False):
+            key = read_answer_key(key_file)
     answers = {normalise_text(answer.student_id): answer for answer in key.answers}
     # an answer key without these students belongs to another class
     is_key_of_this_class = not answers or any(
@@ -145,30 +149,13 @@ def write_assignment(
         log, answer = simulate_assigned_flight(
             secret, student, kind, fault_count, with_ground_truth
         )
+        # a student of the answer key keeps the stored answer
         stored_answer = answers.setdefault(normalise_text(student.student_id), answer)
         _require_answer_key_of_same_flights(key_file, stored_answer.sha256 == answer.sha256)
-        # the questions must be those of the answer key, also if an earlier version wrote the key
-        choices = stored_answer.form.choices if stored_answer.form else ()
-        empty_form = format_answer_form(
-            student.log_file_name, answer.sha256, [choice for choice, _ in choices]
-        )
         log_file = folder / student.log_file_name
-        content_by_path = {
-            log_file: log,
-            log_file.with_name(form_name(log_file.name)): empty_form.encode(),
-        }
-        missing_content_by_path = {
-            path: content
-            for path, content in content_by_path.items()
-            if not _exists_with_same_content(path, content)
-        }
-        # the content of an existing figure file is not compared with that of a new figure, because
-        # it depends on the version of Matplotlib
-        figures_file = log_file.with_suffix(".png")
-        if not figures_file.exists():
-            missing_content_by_path[figures_file] = draw_figures(
-                partial(draw_uniform, secret, student.student_id, kind)
-            )
+        missing_content_by_path = _make_missing_files(
+            log_file, log, stored_answer, partial(draw_uniform, secret, student.student_id, kind)
+        )
         key = AnswerKey(kind, tuple(answers.values()), stored_secret)
         # store the secret before the log: a restart after an interruption needs the secret
         write_output_files({key_file: format_answer_key(key).encode()})
@@ -177,6 +164,28 @@ def write_assignment(
         written_count += log_file in missing_content_by_path
         progress(finished_count, len(students))
     return key, written_count
+
+
+def _make_missing_files(
+    log_file: Path, log: bytes, answer: CorrectAnswers, draw_number: DrawRandomNumber
+) -> dict[Path, bytes]:
+    """Return the contents of log, answer form and figures of a student, except existing files."""
+    # the questions must be those of the answer key, also if an earlier version wrote the key
+    choices = answer.form.choices if answer.form else ()
+    empty_form = format_answer_form(
+        log_file.name, answer.sha256, [choice for choice, _ in choices]
+    ).encode()
+    form_file = log_file.with_name(form_name(log_file.name))
+    contents = {
+        path: content
+        for path, content in ((log_file, log), (form_file, empty_form))
+        if not _exists_with_same_content(path, content)
+    }
+    # a figure is never compared: its bytes depend on the version of Matplotlib
+    figures_file = log_file.with_suffix(".png")
+    if not figures_file.exists():
+        contents[figures_file] = draw_figures(draw_number)
+    return contents
 
 
 def _exists_with_same_content(path: Path, content: bytes) -> bool:

@@ -1,13 +1,13 @@
 """Multiple-choice questions about figures of simulated flights."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from io import BytesIO
 
 import pandas as pd
 
 from px4fuse.comparison.comparison import compute_position_errors
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, Comparison, FilterName
-from px4fuse.core.record import Record, read_toml
+from px4fuse.core.record import read_toml
 from px4fuse.flight.model import Ekf2, Truth
 from px4fuse.report import panels, style
 from px4fuse.results.answer_form import CHOICE_LETTERS, Choice, ChoiceLetter
@@ -16,7 +16,7 @@ from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import make_scenario
 
 from .key import compare_simulation
-from .random_assignment import draw_scenario_numbers
+from .random_assignment import DrawRandomNumber, draw_scenario_numbers
 
 FIGURE_COUNT = 3
 # Number of straight passes along the path in each simulated flight
@@ -24,7 +24,7 @@ STRAIGHT_PASS_COUNT = 4
 # Plots of position errors: the background is grey while the velocity (m/s) in the positive
 # direction of the path exceeds this value
 MIN_SPEED_FOR_GREY_BACKGROUND_M_S = 0.2
-# Questions about each figure; the keys are fields of FigureAnswers
+# Questions about each figure; figures.toml contains the answers by these keys
 QUESTIONS = {
     "fault": "injected fault of the flight",
     "evidence": "plots that show the fault, and plots that do not show the fault",
@@ -34,50 +34,23 @@ QUESTIONS = {
 }
 
 
-class FigureAnswers(Record):
-    """Right answers to the questions about the figure of a simulated flight with one fault.
-
-    Attributes
-    ----------
-    fault : str
-        Name of the injected fault.
-    evidence : str
-        Plots that show the fault.
-    change : str
-        Smallest change that makes KF and EKF2 consistent.
-    prediction : str
-        Effect on KF and EKF2 if SIGMA_Z and EKF2_EVP_NOISE are multiplied by 3.
-    useless : str
-        Change that does not correct the fault, with the reason.
-    mistake_option : str
-        Value of ``px4fuse simulate --mistake`` for this fault; "" for a flight without a fault.
-    """
-
-    fault: str
-    evidence: str
-    change: str
-    prediction: str
-    useless: str
-    mistake_option: str = ""
+# Right answers about a flight with one fault by key of the question, and the value of
+# ``px4fuse simulate --mistake`` for this fault ("mistake_option")
+FIGURE_ANSWERS_BY_FAULT = read_toml(__file__, dict[str, dict[str, str]])
 
 
-FIGURE_ANSWERS_BY_FAULT = read_toml(__file__, dict[str, FigureAnswers])
-
-
-def _shuffle(
-    names: Iterable[str], seed_prefix: str, draw_number: Callable[[str], float]
-) -> list[str]:
+def _shuffle(names: Iterable[str], seed_prefix: str, draw_number: DrawRandomNumber) -> list[str]:
     return sorted(names, key=lambda name: draw_number(f"{seed_prefix} {name}"))
 
 
-def _select_fault_kinds(draw_number: Callable[[str], float]) -> dict[str, str]:
+def _select_fault_kinds(draw_number: DrawRandomNumber) -> dict[str, str]:
     """Select the injected fault of each figure at random; return the fault by figure title."""
     fault_kinds = _shuffle(FIGURE_ANSWERS_BY_FAULT, "figures", draw_number)[:FIGURE_COUNT]
     return {f"Figure {number}": kind for number, kind in enumerate(fault_kinds, start=1)}
 
 
 def make_choice_questions(
-    draw_number: Callable[[str], float],
+    draw_number: DrawRandomNumber,
 ) -> tuple[tuple[Choice, ChoiceLetter], ...]:
     """Make the multiple-choice questions about a student's plots, each with its right letter.
 
@@ -90,41 +63,42 @@ def make_choice_questions(
             FIGURE_ANSWERS_BY_FAULT.keys() - {kind}, f"{title} other", draw_number
         )
         fault_kinds = [kind, *other_fault_kinds[: len(CHOICE_LETTERS) - 1]]
-        for field, question in QUESTIONS.items():
-            shuffled_kinds = _shuffle(fault_kinds, f"{title} {field}", draw_number)
-            options = tuple(
-                getattr(FIGURE_ANSWERS_BY_FAULT[each], field) for each in shuffled_kinds
-            )
+        for key, question in QUESTIONS.items():
+            shuffled_kinds = _shuffle(fault_kinds, f"{title} {key}", draw_number)
+            options = tuple(FIGURE_ANSWERS_BY_FAULT[each][key] for each in shuffled_kinds)
             letter = CHOICE_LETTERS[shuffled_kinds.index(kind)]
             choices.append((Choice(f"{title}: {question}", options), letter))
     return tuple(choices)
 
 
-def draw_figures(draw_number: Callable[[str], float]) -> bytes:
+def draw_figures(draw_number: DrawRandomNumber) -> bytes:
     """Simulate and plot the flights for a student's multiple-choice questions; return one PNG file.
 
     ``draw_number`` is as in :func:`make_choice_questions`.
     """
-    comparisons = {}
-    for title, kind in _select_fault_kinds(draw_number).items():
+    return _plot_figures(
+        {
+            title: _simulate_flight(title, kind, draw_number)
+            for title, kind in _select_fault_kinds(draw_number).items()
+        }
+    )
 
-        def draw_random_number_for_figure(number_name: str, title: str = title) -> float:
-            return draw_number(f"{title} {number_name}")
 
-        random_scenario_parameters = draw_scenario_numbers("aisle", draw_random_number_for_figure)
-        scenario = make_scenario(
-            "aisle",
-            passes=STRAIGHT_PASS_COUNT,
-            seed=int(2**53 * draw_random_number_for_figure("seed")),
-            **random_scenario_parameters,
-        )
-        comparisons[title] = compare_simulation(
-            flights.simulate(
-                scenario,
-                parse_faults(FIGURE_ANSWERS_BY_FAULT[kind].mistake_option.split()),
-            )
-        )
-    return _plot_figures(comparisons)
+def _simulate_flight(title: str, kind: str, draw_number: DrawRandomNumber) -> Comparison:
+    """Simulate and analyse the flight of a figure, with the injected fault ``kind``."""
+
+    def draw_number_of_figure(name: str) -> float:
+        return draw_number(f"{title} {name}")
+
+    scenario = make_scenario(
+        "aisle",
+        passes=STRAIGHT_PASS_COUNT,
+        # an integer: the random numbers are multiples of 2**-53
+        seed=int(2**53 * draw_number_of_figure("seed")),
+        **draw_scenario_numbers("aisle", draw_number_of_figure),
+    )
+    faults = parse_faults(FIGURE_ANSWERS_BY_FAULT[kind].get("mistake_option", "").split())
+    return compare_simulation(flights.simulate(scenario, faults))
 
 
 def _plot_figures(comparisons: Mapping[str, Comparison]) -> bytes:

@@ -288,12 +288,13 @@ def _find_fault_time(
     outlier_times_s = simulation.positions.outlier_times_s.tolist()
     if name == "nlos" and outlier_times_s:
         return outlier_times_s[0], outlier_times_s[-1]
+    # fields of FaultSizes that end in _at_s are start times
     last_field_name = FAULT_TYPES[name].value_field_names[-1]
     if not last_field_name.endswith("_at_s"):
         return None, None
     start_s = getattr(simulation.faults, last_field_name)
     # the size of a dropout is its duration; other faults last until the end
-    return start_s, start_s + size if name.endswith("dropout") else None
+    return start_s, start_s + size if name in ("dropout", "imu-dropout") else None
 
 
 def _determine_right_verdict(comparison: Comparison, filter_name: FilterName) -> CorrectVerdict:

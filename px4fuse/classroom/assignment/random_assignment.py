@@ -22,6 +22,9 @@ from .roster import normalise_text
 
 # Kind of the simulated flights: along an aisle, around a loop, or one of both at random
 FlightKind = Literal["aisle", "loop", "mixed"]
+# Function that returns a random number in [0, 1) for the name of a quantity; equal names give equal
+# numbers
+DrawRandomNumber = Callable[[str], float]
 
 # Minimum length (characters) of the instructor's secret: a shorter secret can be guessed
 MIN_SECRET_LENGTH = 16
@@ -85,7 +88,7 @@ class AssignableFault(Record):
         is_masked = other_fault.group in (self.group, *self.masked_fault_groups.split())
         return not is_masked and self.group not in other_fault.masked_fault_groups.split()
 
-    def format_option(self, difficulty: float, draw_number: Callable[[str], float]) -> str:
+    def format_option(self, difficulty: float, draw_number: DrawRandomNumber) -> str:
         """Return the value of the option ``px4fuse simulate --mistake`` for this fault.
 
         Parameters
@@ -187,14 +190,18 @@ def assign_random_flight(
         # index of the first cumulative probability that is larger than the random number
         *cumulative_probabilities, _ = accumulate(PROBABILITY_BY_FAULT_COUNT[kind])
         fault_count = bisect(cumulative_probabilities, draw_number("count"))
+    # try the faults in random order; omit a fault that masks a selected fault, or is masked by it
     faults: list[AssignableFault] = []
     possible_faults = (fault for fault in ASSIGNABLE_FAULTS if fault.flight_kind == kind)
     for fault in sorted(possible_faults, key=lambda each: draw_number(f"order {each.name}")):
         if len(faults) < fault_count and all(map(fault.is_detectable_with, faults)):
             faults.append(fault)
+    # difficulty: smallest size that px4fuse detects ÷ injected size. Above 1, a fault is smaller
+    # than that, and px4fuse may not detect it
     low, high = EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
     if draw_number("undetectable") < DIFFICULT_FAULTS_PROBABILITY:
         low, high = HARDEST_DIFFICULTY, MAX_FAULT_DIFFICULTY
+    # a fault without size is easy
     difficulties = [
         low + (high - low) * draw_number(f"size {fault.name}")
         if fault.detection_limit
@@ -211,14 +218,11 @@ def assign_random_flight(
         seed=derive_random_bits(secret, student_id, kind, "seed"),
         **draw_scenario_numbers(kind, draw_number),
     )
-    return AssignedFlight(
-        scenario, mistake_options, round(max(difficulties, default=HARDEST_DIFFICULTY), 2)
-    )
+    hardest_difficulty = max(difficulties, default=1.0)
+    return AssignedFlight(scenario, mistake_options, round(hardest_difficulty, 2))
 
 
-def draw_scenario_numbers(
-    kind: ScenarioKind, draw_number: Callable[[str], float]
-) -> dict[str, Any]:
+def draw_scenario_numbers(kind: ScenarioKind, draw_number: DrawRandomNumber) -> dict[str, Any]:
     """Return random values for the numeric fields of :class:`Scenario`."""
     return {
         name: round(low + (high - low) * draw_number(name), decimals)

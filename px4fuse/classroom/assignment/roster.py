@@ -63,18 +63,19 @@ class Sheet:
         column_index = self.find_column_index(titles)
         return "" if column_index is None else row[column_index].strip()
 
-    @property
-    def text(self) -> str:
-        """Table as CSV (RFC 4180), with the original separator."""
-        csv_file = io.StringIO()
-        csv.writer(csv_file, delimiter=self.separator).writerows((self.column_titles, *self.rows))
-        return csv_file.getvalue()
-
     def content(self) -> bytes:
+        text = format_csv((self.column_titles, *self.rows), self.separator)
         try:
-            return self.text.encode(self.encoding)
+            return text.encode(self.encoding)
         except UnicodeEncodeError:  # Windows-1252 lacks some characters of the feedback
-            return self.text.encode("utf-8-sig")
+            return text.encode("utf-8-sig")
+
+
+def format_csv(rows: Iterable[Iterable[str]], separator: str = ",") -> str:
+    """Format a table as CSV (RFC 4180)."""
+    csv_file = io.StringIO()
+    csv.writer(csv_file, delimiter=separator).writerows(rows)
+    return csv_file.getvalue()
 
 
 def normalise_title(title: str) -> str:
@@ -226,15 +227,17 @@ def read_roster(path: Path) -> tuple[Person, ...]:
             f"{path} contains {len(people)} students.",
             f"Give a class list with 1 to {MAX_STUDENTS} students.",
         )
-    person_by_stem: dict[str, Person] = {}
+    # different ids may give the same file name, for example "a/1" and "a_1"
+    used_stems = set()
     for person in people:
-        stem = make_file_stem(person.student_id)
-        if stem is None or person_by_stem.setdefault(stem.casefold(), person) is not person:
+        stem = (make_file_stem(person.student_id) or "").casefold()
+        if not stem or stem in used_stems:
             student_text = shorten_to_line(person.student_id or person.name, 40)
             raise SettingsError(
                 f"{path}: the id of {student_text!r} cannot be used as a file name.",
                 "Give each student a unique id with letters or digits.",
             )
+        used_stems.add(stem)
     return people
 
 

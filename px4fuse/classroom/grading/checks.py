@@ -16,15 +16,10 @@ from px4fuse.core.record import Record, Share
 from px4fuse.core.text import capitalise_first_letter, format_factor, format_metres, shorten_to_line
 from px4fuse.filter.consistency import HorizontalNis
 from px4fuse.filter.time_offset import SourceTimeOffset
-from px4fuse.filter.tuning import HORIZONTAL
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.loop.model import CorrectionName, Loop, PathResult
 from px4fuse.results.answer_form import Answers, check_answers
-from px4fuse.results.contract import (
-    ESTIMATE_FIELD_BY_SETTING,
-    ComparisonResults,
-    ReportedResults,
-    to_json_dict,
-)
+from px4fuse.results.contract import ComparisonResults, ReportedResults, to_json_dict
 from px4fuse.verification.model import Verification
 from px4fuse.verification.verification import flatten, is_number, log_sha256
 
@@ -160,9 +155,10 @@ class ScoringInput:
     def form_points(self) -> FormPoints | str:
         """Points for the student's answers, or the reason for no points."""
         assigned = self.right_answers_for_assigned_log
-        # accept the log of any student if the answer key does not contain this student
-        is_other_log = assigned is not None and not self.is_own_log
-        if self.right_answers is None or is_other_log:
+        # a student who is not in the answer key may use the log of any student
+        if self.right_answers is None or (
+            assigned is not None and assigned.sha256 != self.right_answers.sha256
+        ):
             assigned_log_text = format_reason(assigned.file if assigned else "")
             return (
                 f"this report is not about the log that you were given{assigned_log_text}. Make a "
@@ -334,15 +330,18 @@ class TuningItem(RubricItem, tag="tuning", rename={"factor_at_zero_score": "fact
         comparison = scoring_input.comparison
         label, unit, option = NOISE_SETTINGS[self.setting]
         chosen_value: float = getattr(comparison.settings, self.setting)
-        horizontal_tuning = comparison.tuning.get(HORIZONTAL)
-        interval = getattr(
-            horizontal_tuning, f"{ESTIMATE_FIELD_BY_SETTING[self.setting]}_interval", None
-        )
-        if interval is None or interval[1] is None:
+        interval, tuning = None, comparison.tuning.get(HORIZONTAL)
+        if isinstance(tuning, AxisTuning):
+            interval = tuning.sigma_z_m_interval
+            if self.setting == "sigma_a_m_s2":
+                interval = tuning.sigma_a_two_state_m_s2_interval
+        lower_bound, upper_bound = interval or (0.0, None)
+        if upper_bound is None:  # no estimate, or the data do not limit the noise
             reason_text = scoring_input.find_missing_reason(f"tuning.{HORIZONTAL}")
             return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
-        lower_bound, upper_bound = interval
-        if label == "SIGMA_Z" and scoring_input.has_finding("source_may_drift", "source_drift"):
+        if self.setting == "sigma_z_m" and scoring_input.has_finding(
+            "source_may_drift", "source_drift"
+        ):
             # If the source drifts, SIGMA_Z may be as large as the position error: the estimate of
             # SIGMA_Z is from innovations, which do not contain the drift
             upper_bound = max(upper_bound, _find_max_position_error_m(comparison))
@@ -434,6 +433,7 @@ class TimeOffsetItem(RubricItem, tag="clock"):
             # assigned flight, so they get full points
             if scoring_input.right_answers is not None:
                 return 1.0, statement
+            # an own flight: no points without an estimate, for example if the log has no IMU data
             return self.undeterminable if isinstance(clock, SourceTimeOffset) else 0.0, statement
         (low, high), applied_offset_s = clock.interval_s, clock.applied_s
         statement = (
@@ -476,8 +476,8 @@ class LoopItem(RubricItem, tag="loop"):
 
     def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
         loop = scoring_input.results.loop
-        closures = loop.closures if isinstance(loop, Loop) else ()
-        is_accepted = any(closure.accepted for closure in closures)
+        is_accepted = isinstance(loop, Loop) and any(each.accepted for each in loop.closures)
+        # the landing place is also known if the report contains no loop
         right_answers = scoring_input.right_answers
         true_values = right_answers.true_values if right_answers else {}
         landing_distance_m = true_values.get("closure_error_m", 0.0)
@@ -487,6 +487,7 @@ class LoopItem(RubricItem, tag="loop"):
                 "place, so it is right that no loop closure was accepted."
             )
         if not isinstance(loop, Loop) or loop.closure_error_m is None:
+            # reason for no loop, or for an unknown true end of the loop
             unavailable = loop.true_end if isinstance(loop, Loop) else loop
             reason_text = format_reason(getattr(unavailable, "reason", ""))
             return 0.0, f"Your report does not state a loop closure error{reason_text}."

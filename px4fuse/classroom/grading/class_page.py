@@ -4,7 +4,8 @@ import math
 import statistics
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -159,10 +160,7 @@ def _make_grade_details(grade: Grade) -> Iterator[RowDetailsSection]:
         yield frame.make_list_section("Missing", ["No submission."])
         return
     verification = report.verification
-    differences = [
-        (difference.path, difference.recorded, difference.recomputed)
-        for difference in verification.differences
-    ]
+
     items = [
         (
             item.title,
@@ -181,7 +179,9 @@ def _make_grade_details(grade: Grade) -> Iterator[RowDetailsSection]:
     )
     yield frame.make_list_section("Verification", verification.reasons)
     yield frame.make_table_section(
-        "Numbers that differ from the report", differences, ("Value", "Report", "Recomputed")
+        "Numbers that differ from the report",
+        [*map(astuple, verification.differences)],
+        ("Value", "Report", "Recomputed"),
     )
     title = "Points (proposed)" if report.instructor_action else "Points"
     yield frame.make_table_section(title, items, ("Item", "Points", "Of", "Comment"), (1, 2))
@@ -195,9 +195,9 @@ def _make_grade_details(grade: Grade) -> Iterator[RowDetailsSection]:
 def _make_points_cell(grade: Grade) -> Cell:
     report = grade.counted_report
     if grade.total is None:
-        # pending: the points wait for a decision of the instructor
-        if report is None or report.counted_points is not None:
+        if report is None:
             return Cell("–")
+        # the points wait for a decision of the instructor
         return Cell("pending", None, f"{format_cell_number(report.points)} proposed")
     notes = []
     if grade.deducted_points:
@@ -256,6 +256,14 @@ class ItemStatistics:
     discrimination: float | None
 
 
+class _ItemPoints(NamedTuple):
+    """Points of one report for an item."""
+
+    points: float
+    max_points: float
+    points_of_other_items: float
+
+
 def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
     """Compute the statistics of all graded reports, for three kinds of items.
 
@@ -263,9 +271,7 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
     fault gives one point if the student named it.
     """
     final_reports = [report for report in reports if not report.instructor_action]
-    # for each title of an item: points, maximum points, and points for all other items, in each
-    # report. The correlation of the points is the discrimination of the item
-    scores_by_title = defaultdict[str, list[tuple[float, float, float]]](list)
+    scores_by_title = defaultdict[str, list[_ItemPoints]](list)
     for prefix, items_by_report in (
         ("", [report.items for report in final_reports]),
         ("Answer form: ", [report.form_part_scores for report in final_reports]),
@@ -275,13 +281,14 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
             for item in items:
                 if not item.is_awaiting_points:
                     scores_by_title[prefix + item.title].append(
-                        (item.points, item.max_points, total_points - item.points)
+                        _ItemPoints(item.points, item.max_points, total_points - item.points)
                     )
     for report in final_reports:
         for kind, is_named in report.did_student_name_fault.items():
-            scores_by_title[f"Fault: {kind}"].append((float(is_named), 1.0, report.points))
+            scores_by_title[f"Fault: {kind}"].append(_ItemPoints(is_named, 1.0, report.points))
     statistics = []
     for title, scores in scores_by_title.items():
+        # one array over the reports for each field of _ItemPoints
         points, max_points, points_of_other_items = np.transpose(scores)
         discrimination = None
         has_variation = np.ptp(points) > 0.0 and np.ptp(points_of_other_items) > 0.0

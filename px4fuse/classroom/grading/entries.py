@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import datetime, tzinfo
+from datetime import date, datetime, tzinfo
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -31,12 +31,10 @@ from ..assignment.roster import (
 )
 from .model import (
     TOTAL_TITLE,
-    ExportOrigin,
     Grade,
     GradedReport,
     GradeOverride,
     ItemScore,
-    Submission,
     select_counted_reports,
 )
 from .rubric import Rubric, flag_equal_contents
@@ -156,17 +154,9 @@ class _CandidateReport(NamedTuple):
 
 
 def build_grades(
-    reports: Sequence[GradedReport],
-    submissions: Sequence[Submission],
-    course: Course,
-    overrides: OverridesByStudent,
+    reports: Sequence[GradedReport], course: Course, overrides: OverridesByStudent
 ) -> tuple[tuple[Grade, ...], tuple[str, ...]]:
     """Assign the reports to students, and compute the grade of each student.
-
-    Parameters
-    ----------
-    reports, submissions : sequences
-        Graded report and file of each submission.
 
     Returns
     -------
@@ -175,7 +165,7 @@ def build_grades(
     notes : tuple of str
         Sentences about missing times, and about points without a matching student or item.
     """
-    grades = _choose_reports(reports, submissions, course)
+    grades = _choose_reports(reports, course)
     overrides_per_grade, notes = match_overrides(overrides, grades)
     flags_by_submission = flag_equal_contents(select_counted_reports(grades))
     grades_with_report = [grade for grade in grades if grade.counted_report]
@@ -192,24 +182,22 @@ def build_grades(
     return tuple(final_grades), tuple(notes)
 
 
-def _choose_reports(
-    reports: Sequence[GradedReport], submissions: Sequence[Submission], course: Course
-) -> list[Grade]:
+def _choose_reports(reports: Sequence[GradedReport], course: Course) -> list[Grade]:
     """Assign the reports to students, and choose the report that counts for each student.
 
     Each report of an unknown student gets a grade.
     """
     class_list, unknown_student_flag = course.class_list, "The student is not in the class list."
     if not class_list.people:
-        class_list = _collect_students(reports, submissions)
+        class_list = _collect_students(reports)
         unknown_student_flag = "Neither the report nor the learning platform names a student."
     candidates_by_student_index: dict[int, list[_CandidateReport]] = defaultdict(list)
     grades_of_unknown_students = []
-    for report, submission in zip(reports, submissions, strict=True):
-        student_index = class_list.find_student_index(submission.origin.person)
+    for report in reports:
+        student_index = class_list.find_student_index(report.origin.person)
         if student_index is None:
             student_index = class_list.find_student_index(Person(report.student_id, report.student))
-        candidate = _make_candidate(report, submission, course, student_index, class_list)
+        candidate = _make_candidate(report, course, student_index, class_list)
         if student_index is None:
             flags = (unknown_student_flag, *candidate.grade.flags)
             grades_of_unknown_students.append(replace(candidate.grade, flags=flags))
@@ -225,20 +213,17 @@ def _choose_reports(
     return [*grades_of_students, *grades_of_unknown_students]
 
 
-def _collect_students(
-    reports: Sequence[GradedReport], submissions: Sequence[Submission]
-) -> ClassList:
+def _collect_students(reports: Sequence[GradedReport]) -> ClassList:
     """Make a class list of the students that learning platforms and reports name."""
     class_list = ClassList()
-    for report, submission in zip(reports, submissions, strict=True):
-        person = submission.origin.person
-        reported_student_index = class_list.find_student_index(Person(report.student_id))
+    for report in reports:
+        person, new_id = report.origin.person, report.student_id
+        if class_list.find_student_index(Person(new_id)) is not None:
+            new_id = ""  # the id in the report is that of a listed student
         if person.numbers or person.login:  # the learning platform identifies the student
             if class_list.find_student_index(person) is not None:
                 continue
-            student_id, name = person.student_id, person.name
-            if not student_id and reported_student_index is None:
-                student_id = report.student_id
+            student_id, name = person.student_id or new_id, person.name
             if student_id:
                 name = report.student.strip() or name
             else:
@@ -247,25 +232,19 @@ def _collect_students(
                 student_id = person.login or " ".join(person.numbers.values())
             person = replace(person, student_id=student_id, name=shorten_to_line(name, 200))
             class_list.people.append(person)
-        elif report.student_id and reported_student_index is None:
-            class_list.people.append(
-                Person(report.student_id, shorten_to_line(report.student, 200))
-            )
+        elif new_id:  # only the report identifies the student
+            class_list.people.append(Person(new_id, shorten_to_line(report.student, 200)))
     return class_list
 
 
 def _make_candidate(
-    report: GradedReport,
-    submission: Submission,
-    course: Course,
-    student_index: int | None,
-    class_list: ClassList,
+    report: GradedReport, course: Course, student_index: int | None, class_list: ClassList
 ) -> _CandidateReport:
     """Return a report with its submission time, and the grade that it gives to the student.
 
     The grade applies only if the report is chosen from all reports of the student.
     """
-    origin = submission.origin
+    origin = report.origin
     person = (
         Person(report.student_id) if student_index is None else class_list.people[student_index]
     )
@@ -275,7 +254,7 @@ def _make_candidate(
         due_time = parse_due_time(person.extended_due, name, due_time.tzinfo)
     submission_time = origin.time or parse_moodle_time(person.submission_time)
     if submission_time is not None:
-        submission_time = add_time_zone(submission_time, due_time)
+        submission_time = add_time_zone(submission_time, due_time.tzinfo if due_time else None)
     lateness_s, deducted_points = None, 0.0
     if due_time is not None and submission_time is not None:
         # UNIX times, because differences of datetime objects ignore daylight saving time
@@ -291,7 +270,7 @@ def _make_candidate(
         lateness_s=lateness_s,
         deducted_points=deducted_points,
         max_points=report.max_points,
-        flags=tuple(_flag_submission(report, origin, lateness_s, student_index, class_list)),
+        flags=tuple(_flag_submission(report, lateness_s, student_index, class_list)),
     )
     time_s = submission_time.timestamp() if submission_time else 0.0
     return _CandidateReport(time_s, report, grade)
@@ -299,12 +278,12 @@ def _make_candidate(
 
 def _flag_submission(
     report: GradedReport,
-    origin: ExportOrigin,
     lateness_s: float | None,
     student_index: int | None,
     class_list: ClassList,
 ) -> Iterator[str]:
     """Yield sentences about the time and the student of a submission."""
+    origin = report.origin
     platform = origin.platform.capitalize()
     if origin.is_late and lateness_s is None:
         yield (
@@ -338,18 +317,16 @@ def _choose_counted_report(candidates: Sequence[_CandidateReport], course: Cours
 
     def rank(candidate: _CandidateReport) -> tuple[float, float, str]:
         points = max(candidate.report.points - candidate.grade.deducted_points, 0.0)
-        time_s = candidate.time_s
-        criteria = {
-            "latest": (time_s, points),
-            "first": (-time_s, points),
-            "best": (points, time_s),
-        }
         # the name decides between reports with equal time and points
-        return (*criteria[course.attempt], candidate.report.submission)
+        time_s, name = candidate.time_s, candidate.report.submission
+        if course.attempt == "best":
+            return points, time_s, name
+        return (-time_s if course.attempt == "first" else time_s), points, name
 
     chosen = max(eligible_candidates, key=rank)
     report, flags = chosen.report, list(chosen.grade.flags)
-    # without this rule, students could hand in several answer forms with different guesses
+    # students could hand in several answer forms with different guesses. If the best report counts,
+    # flag different forms; otherwise only the forms of the same time compete
     if course.attempt == "best":
         if len({each.report.form for each in readable}) > 1:
             flags.append(
@@ -365,9 +342,9 @@ def _choose_counted_report(candidates: Sequence[_CandidateReport], course: Cours
             report = replace(report, instructor_action=action)
     others = [each for each in candidates if each is not chosen]
     for other in others:
-        is_report = bool(other.report.version)
-        if other.time_s >= chosen.time_s and (other.report.instructor_action or not is_report):
-            status = "pending" if is_report else "not a report"
+        is_pending = other.report.instructor_action or not other.report.version
+        if is_pending and other.time_s >= chosen.time_s:
+            status = "pending" if other.report.version else "not a report"
             name = shorten_to_line(other.report.submission, 80)
             flags.append(f"The file {name} does not count for the grade: it is {status}.")
     return replace(
@@ -491,7 +468,7 @@ def match_overrides(
     """
     matched_overrides: list[dict[str, GradeOverride]] = [{} for _ in grades]
     max_points_of_reports = (report.max_points for grade in grades for report in grade.reports)
-    max_total_points = max(max_points_of_reports, default=math.inf)
+    max_points_of_class = max(max_points_of_reports, default=math.inf)
     class_list = ClassList(Person(grade.student_id, login=grade.file_name) for grade in grades)
     notes = []
     for student, override_by_item in overrides.items():
@@ -502,27 +479,31 @@ def match_overrides(
             notes.append(f"{OVERRIDES_NAME}: no student has the id {student_text}.")
             continue
         override_by_item_title = matched_overrides[student_index]
-        max_points_by_title = {TOTAL_TITLE: max_total_points, "": math.inf}
-        if report := grades[student_index].counted_report:
-            max_points_by_title[TOTAL_TITLE] = report.max_points
+        report = grades[student_index].counted_report
+        # titles that the instructor may use ("": comment on the whole report), and maximum points
+        max_points_by_title = {
+            TOTAL_TITLE: report.max_points if report else max_points_of_class,
+            "": math.inf,
+        }
+        if report:
             max_points_by_title |= {item.title: item.max_points for item in report.items}
+        # case and outer blanks may differ
         title_by_normalised_title = {normalise_text(title): title for title in max_points_by_title}
         for item_title, override in override_by_item.items():
-            title = title_by_normalised_title.get(normalise_text(item_title), item_title)
-            max_points, problem = max_points_by_title.get(title), ""
-            if max_points is None:
+            title, problem = title_by_normalised_title.get(normalise_text(item_title)), ""
+            if title is None:
                 problem = (
                     f"student {student_text} has no rubric item {shorten_to_line(item_title, 60)!r}"
                 )
             elif title in override_by_item_title:
                 problem = f"student {student_text} has two rows for {title or 'the whole report'!r}"
-            elif (override.points or 0.0) > max_points:
+            elif (override.points or 0.0) > (max_points := max_points_by_title[title]):
                 limit_text = f"{max_points:g} points of {shorten_to_line(title, 60)!r}"
                 problem = f"points of student {student_text} are above the maximum, {limit_text}"
-            if problem:
-                notes.append(f"{OVERRIDES_NAME}: {problem}.")
             else:
                 override_by_item_title[title] = override
+            if problem:
+                notes.append(f"{OVERRIDES_NAME}: {problem}.")
     return matched_overrides, notes
 
 
@@ -565,28 +546,28 @@ def parse_due_time(
         if words and words[-1][0].isalpha():
             time_zone = ZoneInfo(words.pop())
         # ISO 8601: date, "T", time of day and offset from UTC
-        due_time = datetime.fromisoformat("T".join(words[:2]) + "".join(words[2:]))
+        iso_text = "T".join(words[:2]) + "".join(words[2:])
+        due_time = datetime.fromisoformat(iso_text)
     except (ZoneInfoNotFoundError, ValueError, OSError) as error:
         raise SettingsError(
             f"{name} {text!r} is not a valid time. Use '2026-11-20 23:59', optionally "
             "followed by a time zone ('+01:00' or 'Europe/Berlin')."
         ) from error
-    # a date means the end of the day, and a minute its last second
-    time_of_day_match = re.search(r"[^-W\d]\d\d(?::?\d\d(:?\d\d)?)?", "T".join(words))
-    if time_of_day_match is None:
-        due_time = due_time.replace(hour=23, minute=59, second=59)
-    elif time_of_day_match[1] is None:
+    with suppress(ValueError):
+        date.fromisoformat(iso_text)
+        # only a date: the end of the day
+        due_time = due_time.replace(hour=23, minute=59)
+    # without seconds (HH:MM:SS or HHMMSS): the last second of the minute
+    if not re.search(r"\D\d\d:?\d\d:?\d\d", iso_text):
         due_time = due_time.replace(second=59)
-    if due_time.tzinfo is not None:
-        return due_time
-    return due_time.replace(tzinfo=time_zone) if time_zone else due_time.astimezone()
+    return add_time_zone(due_time, time_zone)
 
 
-def add_time_zone(time: datetime, due_time: datetime | None) -> datetime:
-    """Add the time zone of ``due_time``, or of this computer, to a time without a time zone."""
+def add_time_zone(time: datetime, time_zone: tzinfo | None) -> datetime:
+    """Add a time zone (None: that of this computer) to a time without a time zone."""
     if time.tzinfo is not None:
         return time
-    return time.replace(tzinfo=due_time.tzinfo) if due_time is not None else time.astimezone()
+    return time.replace(tzinfo=time_zone) if time_zone else time.astimezone()
 
 
 def parse_moodle_time(text: str) -> datetime | None:

@@ -115,24 +115,25 @@ class FormPoints:
 def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> FormPoints:
     """Compare a student's answers with the right answers, and compute the points."""
     is_recognised_as_fault_free = not right_answers.mistakes and answers.declares_no_fault
+    # maximum points of each part; with figures, the questions about the flight give a fraction
     flight_fraction = POINTS_FRACTION_OF_FLIGHT_QUESTIONS if right_answers.choices else 1.0
+    table_name = "weights_clean" if is_recognised_as_fault_free else "weights"
     weights = {
-        name: flight_fraction * max_points
-        for name, max_points in POINTS_CONFIG[
-            "weights_clean" if is_recognised_as_fault_free else "weights"
-        ].items()
+        name: flight_fraction * max_points for name, max_points in POINTS_CONFIG[table_name].items()
     }
+    # score (0 to 1) of each part
     scores = dict.fromkeys(FORM_PART_NAMES, 0.0)
     matches, wrongly_named_faults = _match_faults(answers, right_answers)
     if is_recognised_as_fault_free:
         scores["mistakes"] = 1.0
-    elif len(wrongly_named_faults) < MIN_FALSE_FAULTS_FOR_ZERO_POINTS:
+    elif len(wrongly_named_faults) < MIN_FALSE_FAULTS_FOR_ZERO_POINTS:  # otherwise guesses
         scores |= _score_faults(matches, right_answers)
     scores["numbers"] = _score_numbers(answers, right_answers)
     scores["verdicts"] = _score_verdicts(answers, right_answers)
     if not scores["numbers"] and not is_recognised_as_fault_free:
         # verdicts can be guessed, so they give half of the points if no computed number is right
         scores["verdicts"] *= 0.5
+    # points of each part
     points = {name: max_points * scores[name] for name, max_points in weights.items()}
     if right_answers.mistakes and all(fault.size is None for fault in right_answers.mistakes):
         # no injected fault has a size: the points for sizes are given for the right fault names
@@ -195,7 +196,8 @@ def describe_right_answer(fault: InjectedFault) -> str:
 
 def _describe_wrong_answers(answers: Answers, right_answers: CorrectFormAnswers) -> Iterator[str]:
     """Yield feedback on wrong answers about consistency, EKF2, numbers and figures."""
-    # question, answer of the student, and right answer
+    # question, answer of the student, and right answer. Answers that are accepted although they
+    # differ from the right answer are not added
     rows: list[tuple[str, object, object]] = [
         ("consistency of KF", answers.verdict_kf, right_answers.kf.verdict or NOT_AVAILABLE),
         ("consistency of EKF2", answers.verdict_ekf2, right_answers.ekf2.verdict or NOT_AVAILABLE),
@@ -203,6 +205,7 @@ def _describe_wrong_answers(answers: Answers, right_answers: CorrectFormAnswers)
     if _score_ekf2_behaviour(answers, right_answers) < 1.0:
         rows.append(("behaviour of EKF2", answers.ekf2_did, right_answers.ekf2_did))
     tolerance_text = f"within {100.0 * MAX_RELATIVE_NUMBER_ERROR_FOR_FULL_POINTS:g} %"
+    # a form without numbers contains fewer answers than questions
     for question, given, right in zip_longest(
         select_questions(answers.log_sha256), answers.quantities, right_answers.quantities
     ):
@@ -228,8 +231,8 @@ def list_answered_choices(
 ) -> list[AnsweredChoice]:
     letters = (*answers.choices, *[""] * len(right_answers.choices))
     return [
-        AnsweredChoice(choice, right_letter, letter)
-        for (choice, right_letter), letter in zip(right_answers.choices, letters, strict=False)
+        AnsweredChoice(*right_choice, letter)
+        for right_choice, letter in zip(right_answers.choices, letters, strict=False)
     ]
 
 
@@ -285,20 +288,26 @@ def _score_faults(matches: list[FaultMatch], right_answers: CorrectFormAnswers) 
     """
     faults_with_size_count = sum(fault.size is not None for fault, _, _ in matches)
     scores = dict.fromkeys(("mistakes", "sizes", "fault time and plot", "correction"), 0.0)
-    for fault, named_fault, score in matches:
+    for fault, named_fault, kind_score in matches:
         if named_fault is None:
             continue
         size_score = score_fault_size(fault, named_fault)
-        # a fault in GUESSABLE_FAULT_KINDS can be guessed, and its time, plot and correction follow
-        # from its name. The points for them therefore depend on the stated size
-        fault_weight = (size_score if fault.kind in GUESSABLE_FAULT_KINDS else 1.0) / len(matches)
+        evidence_score = score_evidence(fault, named_fault)
+        correction_score = score_correction(fault, named_fault, right_answers)
         # if the student names a similar fault instead of the injected fault, the right time and
         # plot give half of the points
-        evidence_weight = fault_weight if named_fault.kind == fault.kind else 0.5 * fault_weight
-        scores["mistakes"] += score / len(matches)
-        scores["fault time and plot"] += score_evidence(fault, named_fault) * evidence_weight
-        scores["correction"] += score_correction(fault, named_fault, right_answers) * fault_weight
-        scores["sizes"] += size_score / max(faults_with_size_count, 1)
+        if named_fault.kind != fault.kind:
+            evidence_score *= 0.5
+        # a fault in GUESSABLE_FAULT_KINDS can be guessed, and its time, plot and correction follow
+        # from its name. The points for them therefore depend on the stated size
+        if fault.kind in GUESSABLE_FAULT_KINDS:
+            evidence_score *= size_score
+            correction_score *= size_score
+        scores["mistakes"] += kind_score / len(matches)
+        scores["fault time and plot"] += evidence_score / len(matches)
+        scores["correction"] += correction_score / len(matches)
+        if fault.size is not None:
+            scores["sizes"] += size_score / faults_with_size_count
     return scores
 
 
@@ -353,16 +362,17 @@ def score_correction(
     fault: InjectedFault, named_fault: NamedFault, right_answers: CorrectFormAnswers
 ) -> float:
     """Return the score (0 to 1) for the parameter and the value that correct a fault."""
-    stated_value = named_fault.convert_value_to_standard_unit()
-    scores = [
-        score
-        if (low, high) == NO_BOUNDS
-        else score
-        * (0.5 if stated_value is None else _score_number_in_range(stated_value, low, high, 0.5))
-        for parameter, (low, high), score in find_accepted_corrections(fault, right_answers)
-        if parameter == named_fault.parameter
-    ]
-    return max(scores, default=0.0)
+    stated_value, best_score = named_fault.convert_value_to_standard_unit(), 0.0
+    for parameter, bounds, score in find_accepted_corrections(fault, right_answers):
+        if parameter == named_fault.parameter:
+            # the right parameter with a wrong or without a value gives half of the score
+            value_score = 0.5
+            if bounds == NO_BOUNDS:
+                value_score = 1.0
+            elif stated_value is not None:
+                value_score = _score_number_in_range(stated_value, *bounds, 0.5)
+            best_score = max(best_score, score * value_score)
+    return best_score
 
 
 def _score_number_in_range(
@@ -381,14 +391,17 @@ AcceptedCorrection = tuple[str, tuple[float, float], float]
 def find_accepted_corrections(
     fault: InjectedFault, right_answers: CorrectFormAnswers
 ) -> list[AcceptedCorrection]:
+    """Return the rows of ``corrections.csv`` for a fault, with numbers as ranges."""
     size, lower_bound, upper_bound = (value or 0.0 for value in (fault.size, fault.low, fault.high))
     fault_start_s = fault.from_s or 0.0
     fault_end_s = fault_start_s if fault.until_s is None else fault.until_s
     # ranges that the column right_value_range of corrections.csv names
     range_by_name = {
         "": NO_BOUNDS,
+        # value that cancels the fault
         "negated": (-upper_bound, -lower_bound),
         "size": (lower_bound, upper_bound),
+        # delay (ms) for a time offset (s)
         "late milliseconds": (1e3 * lower_bound, 1e3 * upper_bound),
         # the student must increase a rate to at least twice the injected value
         "twice": (2.0 * size, 1e4),
@@ -403,14 +416,16 @@ def find_accepted_corrections(
     }
     accepted_corrections = []
     for rule in CORRECTION_RULES:
+        if fault.kind not in rule.fault_kinds.split():
+            continue
         # EKF2_EV_DELAY cannot be negative, so it does not correct timestamps that are too early
-        is_possible = size > 0.0 or rule.right_value_range != "late milliseconds"
-        if fault.kind in rule.fault_kinds.split() and is_possible:
-            if rule.right_value_range in range_by_name:
-                low, high = range_by_name[rule.right_value_range]
-            else:
-                low, high = map(float, rule.right_value_range.split(" to "))
-            accepted_corrections.append((rule.parameter, (low, high), rule.score))
+        if rule.right_value_range == "late milliseconds" and size <= 0.0:
+            continue
+        if rule.right_value_range in range_by_name:
+            low, high = range_by_name[rule.right_value_range]
+        else:
+            low, high = map(float, rule.right_value_range.split(" to "))
+        accepted_corrections.append((rule.parameter, (low, high), rule.score))
     return accepted_corrections
 
 
@@ -423,15 +438,14 @@ def _score_verdicts(answers: Answers, right_answers: CorrectFormAnswers) -> floa
 
 def _score_ekf2_behaviour(answers: Answers, right_answers: CorrectFormAnswers) -> float:
     """Return 1 if the reported behaviour of EKF2 is right, 1/2 with one error, otherwise 0."""
-    stated_behaviours, required_behaviours = set(answers.ekf2_did), set(right_answers.ekf2_did)
-    allowed_behaviours = set(right_answers.ekf2_did_also)
-    false_behaviour_count = len(stated_behaviours - required_behaviours - allowed_behaviours)
-    if len(stated_behaviours) == false_behaviour_count or false_behaviour_count > 1:
+    stated, required = set(answers.ekf2_did), set(right_answers.ekf2_did)
+    right = stated & {*required, *right_answers.ekf2_did_also}
+    false_count = len(stated - right)
+    if not right or false_count > 1:
         return 0.0
-    is_complete = required_behaviours <= stated_behaviours or (
-        len(required_behaviours) == 1 and stated_behaviours & allowed_behaviours
-    )
-    return 1.0 if is_complete and not false_behaviour_count else 0.5
+    # an allowed behaviour also counts as the only required one
+    is_complete = required <= stated or len(required) == 1
+    return 1.0 if is_complete and not false_count else 0.5
 
 
 def _score_choices(answers: Answers, right_answers: CorrectFormAnswers) -> float:
@@ -455,10 +469,9 @@ def _score_numbers(answers: Answers, right_answers: CorrectFormAnswers) -> float
 
 def _score_number(answer: NumericAnswer, right_answer: NumericAnswer) -> float:
     if isinstance(right_answer, tuple) and answer is not None:
-        answer = answer if isinstance(answer, tuple) else (answer,)
-        difference_count = len(set(answer) ^ set(right_answer))
-        has_right_number = not set(answer).isdisjoint(right_answer)
-        return max(1.0 - 0.5 * difference_count, 0.0) * has_right_number
+        # list of numbers: each missing and each false number costs half of the points
+        given, right = set(answer if isinstance(answer, tuple) else (answer,)), set(right_answer)
+        return max(1.0 - 0.5 * len(given ^ right), 0.0) if given & right else 0.0
     if isinstance(answer, float | int) and isinstance(right_answer, float | int):
         error, magnitude = abs(answer - right_answer), abs(right_answer)
         if error <= MAX_RELATIVE_NUMBER_ERROR_FOR_FULL_POINTS * magnitude:

@@ -1,7 +1,7 @@
 """Grading of a class: verify and score all submitted reports in parallel, and write the output."""
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,7 +21,7 @@ from px4fuse.results.model import provenance
 from px4fuse.results.reading import read_results
 from px4fuse.verification.model import Verification
 from px4fuse.verification.pdf_input import read_report
-from px4fuse.verification.verification import log_sha256, recompute_report, verify
+from px4fuse.verification.verification import PathBySha256, log_sha256, recompute_report, verify
 
 from ..assignment.key import AnswerKey
 from . import submissions
@@ -95,6 +95,7 @@ def grade(
         The folder cannot be written.
     """
     overrides = read_overrides(output / OVERRIDES_NAME)
+    # raise the errors of the tables before the long verification
     for worksheet in course.worksheets:
         find_grade_column(worksheet, course.grade_column_title)
     unread_file_notes = [
@@ -103,6 +104,26 @@ def grade(
         if file.name != OVERRIDES_NAME
     ]
     found_submissions, notes = submissions.find_submissions(paths)
+    reports, reused_count = _grade_submissions(
+        found_submissions, course, output / RECORDS_FOLDER, processes, progress
+    )
+    grades, override_notes = build_grades(reports, course, overrides)
+    written_paths, class_notes = write_grading_files(grades, course, output)
+    all_notes = *notes, *unread_file_notes, *override_notes, *class_notes
+    return GradeOutcome(grades, all_notes, reused_count, written_paths)
+
+
+def _grade_submissions(
+    found_submissions: Sequence[Submission],
+    course: Course,
+    records_folder: Path,
+    processes: int | None,
+    progress: Callable[[int, int], None],
+) -> tuple[list[GradedReport], int]:
+    """Verify and score submissions in parallel.
+
+    Return the reports in the order of the submissions, and the number of reused verifications.
+    """
     jobs = []
     for submission in found_submissions:
         student_index = course.class_list.find_student_index(submission.origin.person)
@@ -115,7 +136,7 @@ def grade(
         course.rubric,
         course.key,
         hash_files(course.logs),
-        output / RECORDS_FOLDER,
+        records_folder,
         max_log_bytes.get(),
     )
     report_by_index: dict[int, GradedReport] = {}
@@ -132,25 +153,19 @@ def grade(
                 report, is_loaded_from_cache = result
                 reused_count += is_loaded_from_cache
             submission, student = found_submissions[index], report.student
-            if not student and not report.student_id:
+            if not student and not report.student_id:  # use the name from the learning platform
                 student = submission.origin.person.name
-            report_by_index[index] = replace(report, submission=submission.name, student=student)
+            report_by_index[index] = replace(
+                report, submission=submission.name, student=student, origin=submission.origin
+            )
             progress(len(report_by_index), len(found_submissions))
-    grades, override_notes = build_grades(
-        [report for _, report in sorted(report_by_index.items())],
-        found_submissions,
-        course,
-        overrides,
-    )
-    written_paths, class_notes = write_grading_files(grades, course, output)
-    all_notes = *notes, *unread_file_notes, *override_notes, *class_notes
-    return GradeOutcome(grades, all_notes, reused_count, written_paths)
+    return [report_by_index[index] for index in range(len(jobs))], reused_count
 
 
 def grade_submission(
     rubric: Rubric,
     answer_key: AnswerKey | None,
-    path_by_sha256: Mapping[str, Path],
+    path_by_sha256: PathBySha256,
     records_folder: Path,
     max_bytes: int,
     job: tuple[Submission, str],
@@ -214,7 +229,7 @@ class VerificationRecord:
 def load_or_verify(
     records_folder: Path,
     pdf: bytes,
-    path_by_sha256: Mapping[str, Path],
+    path_by_sha256: PathBySha256,
     assigned_hashes: frozenset[str],
 ) -> tuple[ReportedResults, Verification, bool]:
     """Read and verify a report, or load the result of an earlier verification.
@@ -251,28 +266,31 @@ def load_or_verify(
     versions_and_files = _collect_versions_and_files(
         to_json(results), path_by_sha256, assigned_hashes
     )
-    # the report is about an assigned log that was not given to this command. Without any log,
-    # verify() returns "cannot verify" instead of "other log", which would be the student's fault
-    is_log_missing = versions_and_files.get(log_sha256(results)) == "assigned"
-    verification = verify(results, pdf, {} if is_log_missing else path_by_sha256)
-    files = {REDRAWN_REPORT_SUFFIX: verification.redrawn_pdf} if verification.redrawn_pdf else {}
+    if versions_and_files.get(log_sha256(results)) == "assigned":
+        # the report is about an assigned log that was not given to this command. Without any log,
+        # verify() returns "cannot verify" instead of "other log", which would be the student's
+        # fault
+        path_by_sha256 = {}
+    verification, diagnosis_pdf = verify(results, pdf, path_by_sha256), b""
     if verification.status == "verified" and log_sha256(results) in assigned_hashes:
-        results, files[DIAGNOSIS_SUFFIX] = repeat_analysis_with_diagnosis(results, path_by_sha256)
+        results, diagnosis_pdf = repeat_analysis_with_diagnosis(results, path_by_sha256)
+    for suffix, content in (
+        (REDRAWN_REPORT_SUFFIX, verification.redrawn_pdf),
+        (DIAGNOSIS_SUFFIX, diagnosis_pdf),
+    ):
+        if content:
+            write_output_files({record_path.with_suffix(suffix): content})
+        else:  # delete the PDF of an earlier verification
+            record_path.with_suffix(suffix).unlink(missing_ok=True)
+    # the PDFs are stored as files only
     verification = replace(verification, redrawn_pdf=b"")
     record = VerificationRecord(versions_and_files, to_json(results), verification)
-    files[".json"] = msgspec.json.encode(record)
-    # delete PDFs of an earlier verification; the JSON file is replaced, because another process may
-    # read it if two students handed in the same PDF
-    for suffix in (REDRAWN_REPORT_SUFFIX, DIAGNOSIS_SUFFIX):
-        record_path.with_suffix(suffix).unlink(missing_ok=True)
-    write_output_files(
-        {record_path.with_suffix(suffix): content for suffix, content in files.items()}
-    )
+    write_output_files({record_path.with_suffix(".json"): msgspec.json.encode(record)})
     return results, verification, False
 
 
 def _load_verification(
-    record_path: Path, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
+    record_path: Path, path_by_sha256: PathBySha256, assigned_hashes: frozenset[str]
 ) -> tuple[ReportedResults, Verification] | None:
     """Load an earlier verification; None if it is missing, unreadable or had other inputs."""
     try:
@@ -290,7 +308,7 @@ def _load_verification(
 
 
 def repeat_analysis_with_diagnosis(
-    results: ReportedResults, path_by_sha256: Mapping[str, Path]
+    results: ReportedResults, path_by_sha256: PathBySha256
 ) -> tuple[ReportedResults, bytes]:
     """Repeat the analysis and include the faults that were hidden from the student.
 
@@ -308,7 +326,7 @@ def repeat_analysis_with_diagnosis(
 
 
 def _collect_versions_and_files(
-    results: str, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
+    results: str, path_by_sha256: PathBySha256, assigned_hashes: frozenset[str]
 ) -> dict[str, str]:
     """Return library versions and input files, on which a stored verification depends.
 

@@ -87,6 +87,8 @@ class GradedReport:
     ----------
     submission : str
         Name of the submission in messages.
+    origin : ExportOrigin
+        Student and submission time from the learning platform.
     student, student_id : str
         Name and id in the report.
     instructor_action : str
@@ -122,6 +124,7 @@ class GradedReport:
     notes: str = field(default="", repr=False)
     did_student_name_fault: Mapping[str, bool] = field(default_factory=dict)
     form_part_scores: tuple[ItemScore, ...] = ()
+    origin: ExportOrigin = UNKNOWN_EXPORT_ORIGIN
     redrawn_report_path: str = ""
 
     @property

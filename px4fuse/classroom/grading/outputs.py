@@ -25,9 +25,9 @@ from px4fuse.errors import SettingsError
 from px4fuse.verification.model import Verification
 
 from ..assignment.roster import (
-    ClassList,
     Sheet,
     format_cell_number,
+    format_csv,
     make_file_names,
     make_unique,
     normalise_text,
@@ -123,6 +123,8 @@ def write_grading_files(
     """
     class_title = course.title or course.rubric.title or "Class"
     file_stems = make_file_names(grade.student_id or Path(grade.file_name).stem for grade in grades)
+    # the page of the class links the recomputed reports, and may be anonymous; all other files use
+    # ``grades``
     class_page_grades = [
         _copy_redrawn_report(grade, stem, output)
         for grade, stem in zip(grades, file_stems, strict=True)
@@ -147,23 +149,19 @@ def write_grading_files(
         texts[f"{FEEDBACK_FOLDER}/{stem}.txt"] = text
     contents = {name: text.encode() for name, text in texts.items()}
     notes: list[str] = []
+    # worksheets of the same name are from different folders
     table_names = make_unique((sheet.path.name for sheet in course.worksheets), "{1}-{0}")
     for sheet, name in zip(course.worksheets, table_names, strict=True):
-        filled_sheet, sheet_notes = fill_grades(
-            sheet,
-            grades,
-            course.class_list,
-            course.grade_column_title,
-            feedback_texts,
-            course.scale,
-        )
+        filled_sheet, sheet_notes = fill_grades(sheet, grades, course, feedback_texts)
         contents[f"{GRADES_FOLDER}/{name}"] = filled_sheet.content()
         notes += sheet_notes
     write_output_files({output / name: content for name, content in contents.items()})
-    output_names = dict.fromkeys([*(name.partition("/")[0] for name in contents), OVERRIDES_NAME])
+    # list each file or folder of the output folder once; overrides.csv existed, or is new
+    written_names = [*contents, OVERRIDES_NAME]
     if has_redrawn_reports:
-        output_names[REPORTS_FOLDER] = None
-    return tuple(output / name for name in output_names), tuple(notes)
+        written_names.append(REPORTS_FOLDER)
+    written_paths = dict.fromkeys(output / name.partition("/")[0] for name in written_names)
+    return tuple(written_paths), tuple(notes)
 
 
 def _identify_student(grade: Grade) -> str:
@@ -195,7 +193,7 @@ def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade],
     """
     pseudonym_by_identity: dict[str, str] = {}
     if path.exists():
-        with protect_inputs(is_active=False):
+        with protect_inputs(is_active=False):  # the new table replaces this table
             sheet = read_csv_sheet(path)
         for row in sheet.rows:
             pseudonym, identity, _ = (
@@ -203,12 +201,16 @@ def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade],
             )
             pseudonym_by_identity[identity] = pseudonym
     name_by_identity = {_identify_student(grade): grade.student for grade in grades}
-    new_identities = name_by_identity.keys() - pseudonym_by_identity.keys()
-    pseudonym_numbers = range(1, len(new_identities) + len(pseudonym_by_identity) + 1)
-    all_pseudonyms = {f"Student {number:03}" for number in pseudonym_numbers}
-    free_pseudonyms = [*(all_pseudonyms - {*pseudonym_by_identity.values()})]
-    random.SystemRandom().shuffle(free_pseudonyms)
-    pseudonym_by_identity |= zip(new_identities, free_pseudonyms, strict=False)
+    # students keep their pseudonyms; new students get the free ones in random order
+    free_pseudonyms = [
+        pseudonym
+        for number in range(1, len(name_by_identity) + len(pseudonym_by_identity) + 1)
+        if (pseudonym := f"Student {number:03}") not in pseudonym_by_identity.values()
+    ]
+    new_identities = [each for each in name_by_identity if each not in pseudonym_by_identity]
+    pseudonyms = random.SystemRandom().sample(free_pseudonyms, len(new_identities))
+    pseudonym_by_identity |= zip(new_identities, pseudonyms, strict=True)
+    # students who are no longer in the class are omitted
     rows = sorted(
         (pseudonym_by_identity[identity], identity, name)
         for identity, name in name_by_identity.items()
@@ -222,13 +224,14 @@ def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade],
 def anonymise_grade(grade: Grade, pseudonym: str) -> Grade:
     """Replace the name by a pseudonym, and delete all texts that could identify the student."""
     report = grade.counted_report
+    # new objects, so that all fields that are not listed are empty
     if report is not None:
         report = GradedReport(
-            "",
-            "",
-            "",
-            replace(report.verification, reasons=(), differences=()),
-            tuple(replace(item, comment="") for item in report.items),
+            submission="",
+            student="",
+            student_id="",
+            verification=replace(report.verification, reasons=(), differences=()),
+            items=tuple(replace(item, comment="") for item in report.items),
             instructor_action=report.instructor_action
             and "The points are not final: the instructor must confirm the points.",
             form=report.form,
@@ -244,7 +247,7 @@ def anonymise_grade(grade: Grade, pseudonym: str) -> Grade:
         deducted_points=grade.deducted_points,
         total=grade.total,
         max_points=grade.max_points,
-        flags=("Check this report. The reasons are in class.csv.",) * bool(grade.flags),
+        flags=("Check this report. The reasons are in class.csv.",) if grade.flags else (),
     )
 
 
@@ -289,14 +292,14 @@ def format_class_table(grades: Sequence[Grade]) -> str:
 
 def _format_csv(titles: Sequence[str], rows: Iterable[Sequence[str | float | None]]) -> str:
     cell_rows = (
-        tuple(
+        [
             neutralise_formulas(value) if isinstance(value, str) else format_cell_number(value)
             for value in row
-        )
+        ]
         for row in (titles, *rows)
     )
     # Excel detects UTF-8 by the byte order mark
-    return "\ufeff" + Sheet(Path(), next(cell_rows), tuple(cell_rows)).text
+    return "\ufeff" + format_csv(cell_rows)
 
 
 # ------------------------------------------------------------------ feedback
@@ -405,21 +408,22 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
     assignment_column_indices = [
         index for index in editable_column_indices if short_titles[index] != titles[index]
     ]
-    matching_indices = [
-        index
-        for index in editable_column_indices
-        if normalise_text(column_title) in map(normalise_text, (titles[index], short_titles[index]))
-    ]
+    candidate_indices = []
+    if column_title:
+        candidate_indices = [
+            index
+            for index in editable_column_indices
+            if normalise_text(column_title)
+            in map(normalise_text, (titles[index], short_titles[index]))
+        ]
     # a table of Moodle (with a column "identifier") has only one grade column. If no column of the
     # table has the title given with --column, --column is meant for another table
     is_moodle_table = sheet.find_column_index(("identifier",)) is not None
-    grade_column_index = sheet.find_column_index(GRADE_COLUMN_TITLES)
-    if column_title and (matching_indices or not is_moodle_table):
-        candidate_indices = matching_indices
-    elif grade_column_index is not None:
-        candidate_indices = [grade_column_index]
-    else:
+    if not candidate_indices and (is_moodle_table or not column_title):
+        grade_column_index = sheet.find_column_index(GRADE_COLUMN_TITLES)
         candidate_indices = assignment_column_indices
+        if grade_column_index is not None:
+            candidate_indices = [grade_column_index]
     if len(candidate_indices) == 1:
         return candidate_indices[0]
     problem = "several grade columns" if candidate_indices else "no grade column was found"
@@ -432,23 +436,14 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
 
 
 def fill_grades(
-    sheet: Sheet,
-    grades: Sequence[Grade],
-    class_list: ClassList,
-    grade_column_title: str,
-    feedback_texts: Sequence[str],
-    platform_max_points: float | None = None,
+    sheet: Sheet, grades: Sequence[Grade], course: Course, feedback_texts: Sequence[str]
 ) -> tuple[Sheet, tuple[str, ...]]:
     """Enter grades and feedback into a copy of a table of a learning platform.
 
     Parameters
     ----------
     grades, feedback_texts : sequences
-        Grade and feedback of each student in ``class_list``, then of unknown students.
-    grade_column_title : str
-        Title of the grade column; "" if the table has only one.
-    platform_max_points : float, optional
-        Maximum points on the platform; by default those of the rubric.
+        Grade and feedback of each student in ``course.class_list``, then of unknown students.
 
     Returns
     -------
@@ -461,7 +456,8 @@ def fill_grades(
     SettingsError
         No grade column was found, or several.
     """
-    grade_column_index = find_grade_column(sheet, grade_column_title)
+    grade_column_index = find_grade_column(sheet, course.grade_column_title)
+    people = course.class_list.people
     feedback_column_index = sheet.find_column_index(COMMENT_COLUMN_TITLES)
     format_feedback = (
         neutralise_formulas
@@ -476,7 +472,7 @@ def fill_grades(
     notes, matched_student_indices = [], set()
     for row in cells_by_row:
         person = read_student(sheet, row)
-        student_index = class_list.find_student_index(person) if person else None
+        student_index = course.class_list.find_student_index(person) if person else None
         if student_index is None:
             continue
         matched_student_indices.add(student_index)
@@ -484,8 +480,8 @@ def fill_grades(
         points = grade.total
         if points is None:  # the cell is not changed
             continue
-        if platform_max_points is not None and grade.max_points:
-            points = round(points * platform_max_points / grade.max_points, 2)
+        if course.scale is not None and grade.max_points:
+            points = round(points * course.scale / grade.max_points, 2)
         max_points = _find_max_points(sheet, row, grade_column_index)
         if max_points is not None and points > max_points:
             notes.append(
@@ -501,7 +497,7 @@ def fill_grades(
             row[feedback_column_index] = format_feedback(feedback_texts[student_index])
     missing_names = [
         names[index]
-        for index in range(len(class_list.people))
+        for index in range(len(people))
         if index not in matched_student_indices and grades[index].total is not None
     ]
     if missing_names:

@@ -79,9 +79,12 @@ class _EntryError(Exception):
     """Reason why a zip entry or file is not read."""
 
 
-_BROKEN_ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, MemoryError)
-# zipfile raises NotImplementedError, a RuntimeError, for unknown compression methods
-_UNREADABLE_FILE_ERRORS = (_EntryError, *_BROKEN_ZIP_ERRORS, *BAD_VALUE_ERRORS)
+# Exceptions for damaged zip files and other unreadable files. For unknown compression methods,
+# zipfile raises NotImplementedError, a RuntimeError
+_UNREADABLE_FILE_ERRORS = (
+    *(_EntryError, zipfile.BadZipFile, zlib.error, struct.error, EOFError, MemoryError),
+    *BAD_VALUE_ERRORS,
+)
 
 
 def _format_unread_reason(error: Exception) -> str:
@@ -117,23 +120,23 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
     ignored_names, zip_count = list[str](), 0
     for path in paths:
         is_zip = path.is_file() and path.name.lower().endswith(".zip")
-        for submission in (_list_zip_submissions if is_zip else _list_folder_submissions)(
-            path, notes
-        ):
+        list_files = _list_zip_submissions if is_zip else _list_folder_submissions
+        for submission in list_files(path, notes):
             register_input_path(submission.file)
-            suffix = submission.name.lower()[-4:]
-            if suffix in (".pdf", ".zip"):
+            name = submission.name.lower()
+            if name.endswith((".pdf", ".zip")):
+                # a zip file in a folder or zip file is graded as an unreadable report
                 submission_by_path.setdefault((submission.file, submission.zip_entry), submission)
-                zip_count += suffix == ".zip"
-            elif not _is_gradescope_metadata(submission.name):
-                ignored_names.append(_shorten_name(submission.name))
-            else:
+                zip_count += name.endswith(".zip")
+            elif _is_gradescope_metadata(submission.name):
                 try:
-                    origin_by_submission_number |= read_gradescope_metadata(
-                        read_submission(submission).decode("utf-8", errors="replace")
-                    )
+                    content = read_submission(submission).decode("utf-8", errors="replace")
                 except ResultsError as error:
                     notes.append(str(error))
+                else:
+                    origin_by_submission_number |= read_gradescope_metadata(content)
+            else:
+                ignored_names.append(_shorten_name(submission.name))
     if ignored_names:
         names_text = join_first_names(ignored_names, MAX_LISTED_FILES)
         notes.append(f"Ignored files (not PDF): {len(ignored_names)} ({names_text}).")
@@ -166,6 +169,8 @@ def add_submitters(
         submission.file if submission.zip_entry else submission.name.partition("/")[0]
         for submission in submissions
     ]
+    # one platform wrote all names of an export, but students may imitate another platform: count
+    # the platforms, and then parse the names with the pattern of the most frequent platform only
     platform_counts_by_export: dict[object, Counter[str]] = defaultdict(Counter)
     for export, submission in zip(exports, submissions, strict=True):
         if platform := parse_submission_path(submission.name).platform:
@@ -176,7 +181,7 @@ def add_submitters(
         most_common = platform_counts_by_export[export].most_common(1)
         origin = parse_submission_path(submission.name, [platform for platform, _ in most_common])
         if origin.platform in ("gradescope", ""):
-            # Gradescope exports PDFs as SUBMISSION_NUMBER.pdf
+            # Gradescope also exports PDFs as SUBMISSION_NUMBER.pdf, which no pattern matches
             stem = submission.name.rpartition("/")[2].casefold().removesuffix(".pdf")
             number = origin.person.numbers.get("gradescope", stem)
             origin = origin_by_submission_number.get(number, origin)
@@ -244,7 +249,7 @@ def _list_zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
     try:
         with path.open("rb") as file, _open_zip(file) as archive:
             entries = [entry for entry in archive.infolist() if not entry.is_dir()]
-        # declared sizes are safe: zipfile unpacks at most the declared size
+        # the sizes are those that the zip file declares; zipfile never unpacks more than these
         if sum(entry.file_size for entry in entries) > MAX_UNPACKED_BYTES:
             raise _EntryError(
                 f"the zip file unpacks to more than {MAX_UNPACKED_BYTES // 10**9} GB."
@@ -252,17 +257,15 @@ def _list_zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
     except _UNREADABLE_FILE_ERRORS as error:
         notes.append(f"{_shorten_name(path.name)} was ignored: {_format_unread_reason(error)}")
         return []
-    last_entry_by_name = {entry.filename: entry for entry in entries}
-    if len(entries) > len(last_entry_by_name):
-        (name, _), *_ = Counter(entry.filename for entry in entries).most_common(1)
-        raise SettingsError(
-            f"{_shorten_name(path.name)} contains two files with the name {_shorten_name(name)}: a "
-            "student may have added one of them.",
-            "Export the submissions again.",
-        )
+    for name, count in Counter(entry.filename for entry in entries).items():
+        if count > 1:
+            raise SettingsError(
+                f"{_shorten_name(path.name)} contains two files with the name "
+                f"{_shorten_name(name)}: a student may have added one of them.",
+                "Export the submissions again.",
+            )
     submissions = (
-        Submission(path.resolve(), name, _make_entry_label(entry))
-        for name, entry in last_entry_by_name.items()
+        Submission(path.resolve(), entry.filename, _make_entry_label(entry)) for entry in entries
     )
     return [each for each in submissions if not any(map(_is_hidden, each.name.split("/")))]
 
@@ -310,12 +313,9 @@ def _make_entry_label(entry: zipfile.ZipInfo) -> str:
         # zipfile decodes names without UTF-8 flag as code page 437, but most programs write UTF-8
         with suppress(UnicodeError):
             name = name.encode("cp437").decode("utf-8")
-    folders = (
-        folder_name
-        for folder_name in re.split(r"[/\\]", name)
-        if folder_name not in ("", ".", "..")
+    return "/".join(
+        each for each in re.split(r"[/\\]", name) if each not in ("", ".", "..") and each[1:] != ":"
     )
-    return "/".join(folder for folder in folders if folder[1:] != ":")
 
 
 def _read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
@@ -376,12 +376,13 @@ def parse_submission_path(
         # a learning platform adds the text of _PLATFORM_TEXT_PATTERN only once, and only Moodle and
         # Blackboard add it: more matches are forged
         platform_text_count = 1 if platform in ("moodle", "blackboard") else 0
+        found_text_count = len(_PLATFORM_TEXT_PATTERN.findall(name))
         return ExportOrigin(
             platform,
-            Person("", full_name, "", fields.get("login", ""), numbers),
+            Person("", full_name, login=fields.get("login", ""), numbers=numbers),
             time,
-            bool(fields.get("late")),
-            len(_PLATFORM_TEXT_PATTERN.findall(name)) > platform_text_count,
+            is_late=bool(fields.get("late")),
+            has_forged_platform_name=found_text_count > platform_text_count,
         )
     return UNKNOWN_EXPORT_ORIGIN
 
