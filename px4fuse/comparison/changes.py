@@ -80,6 +80,7 @@ def find_candidate_changes(
     is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
     axis_tuning = find_axis_tuning(estimates.tuning, axis)
     changes = list[ChangedValues]()
+    # 1. Noise settings and outliers
     # Do not reduce the noise settings for GNSS or odometry: innovations do not show the slow errors
     # of these sources, only ground truth does
     origin = comparison.source.origin
@@ -95,11 +96,12 @@ def find_candidate_changes(
             )
         if not is_underconfident and len(axis_tuning.outlier_time_s):
             changes.append({OUTLIERS_KEY: float(len(axis_tuning.outlier_time_s))})
-    # For EKF2, the delay parameter corrects the time offset, if PX4 permits the delay
-    delay_change = ekf2_inputs and make_estimated_delay_change(
-        comparison, ekf2_inputs, estimates.time_offset
-    )
+    # 2. Time offset. For EKF2, the delay parameter corrects it, if PX4 permits the delay
+    delay_change = {}
+    if ekf2_inputs is not None:
+        delay_change = make_estimated_delay_change(comparison, ekf2_inputs, estimates.time_offset)
     changes += [delay_change] if delay_change else _find_offset_changes(estimates, ekf2_inputs)
+    # 3. Horizontal axes only: rotation, then accelerometer bias (KF) or default parameters (EKF2)
     if axis == "down":
         return changes
     if (
@@ -126,16 +128,17 @@ def find_main_axis_changes(
 
     The report shows their effect also if the filter is consistent.
     """
-    # Changes for the mean NIS are first
+    # Changes for the mean NIS are first: the report shows the re-runs in this order
     changes = remove_repeated_changes(
         change
-        for statistic in CONSISTENCY_STATISTICS[::-1]
+        for statistic in reversed(CONSISTENCY_STATISTICS)
         for change in find_candidate_changes(
             comparison, estimates, ekf2_inputs, axis, summary, statistic
         )
     )
     if ekf2_inputs is not None:
-        # Correct timestamps have another effect than the delay parameter, which has limits
+        # The user can correct a late EKF2 track by the delay parameter or, alternatively, by the
+        # timestamps. find_candidate_changes returns only one of these changes: test the other, too
         if any(ekf2_inputs.aid.delay in change for change in changes):
             changes += _find_offset_changes(estimates, ekf2_inputs)
         return remove_repeated_changes(changes)
@@ -191,16 +194,15 @@ def _find_offset_changes(
 ) -> list[ChangedValues]:
     """Return the change that corrects the time offset, if the time offset is significant."""
     time_offset = estimates.time_offset
-    if (
-        isinstance(time_offset, Unavailable)
-        or not time_offset.is_determinable
-        or not time_offset.is_significant(
-            time_offset.offset_s if ekf2_inputs else time_offset.remaining_s
-        )
-    ):
+    if isinstance(time_offset, Unavailable) or not time_offset.is_determinable:
+        return []
+    # The user's --clock-offset corrects the timestamps for KF, but not for EKF2
+    uncorrected_s = time_offset.remaining_s if ekf2_inputs is None else time_offset.offset_s
+    if not time_offset.is_significant(uncorrected_s):
         return []
     change = {TIME_OFFSET_KEY: round(time_offset.offset_s, 3)}
     if ekf2_inputs is not None:
+        # With earlier timestamps, positions are older: EKF2 needs a longer buffer to fuse them
         position_age_ms = ekf2_inputs.settings[ekf2_inputs.aid.delay] - 1e3 * time_offset.offset_s
         change |= make_delay_max_change(ekf2_inputs.settings, position_age_ms)
     return [change]
@@ -215,17 +217,15 @@ def _find_kf_noise_changes(
         (SIGMA_A_KEY, axis_tuning.sigma_a_two_state),
         (SIGMA_Z_KEY, axis_tuning.sigma_z),
     ):
-        setting = getattr(settings, name)
-        # A setting is too large above the 95 % interval, and too small below it. Without an
-        # estimate, a setting that is too large is reduced to the upper limit of the interval
-        if is_underconfident:
-            estimate = noise.value_or_bound(0.0)
+        setting, estimate = getattr(settings, name), noise.value
+        if is_underconfident:  # is the setting too large, above the 95 % interval?
             is_significant = noise.high is not None and setting > noise.high
-        else:
-            estimate = noise.value or 0.0
+            if estimate is None:  # only the upper limit is known: reduce the setting to this limit
+                estimate = noise.high
+        else:  # is the setting too small, below the 95 % interval?
             is_significant = noise.low is not None and setting < noise.low
         if noise.value is None and name == SIGMA_Z_KEY:
-            estimate = max(estimate, MIN_RERUN_SIGMA_Z_M)
+            estimate = max(estimate or 0.0, MIN_RERUN_SIGMA_Z_M)
         if estimate and is_significant:
             changes.append({name: float(f"{estimate:.3g}")})
     return changes
@@ -255,15 +255,15 @@ def _find_ekf2_noise_changes(
 
 def _find_default_changes(log: LogInfo, ekf2_inputs: ReplayInputs) -> list[ChangedValues]:
     """Return one change to PX4's default for each EKF2 noise that differs from the default."""
-    gate, logged_parameters, changes = (
-        ekf2_inputs.aid.gate,
-        ekf2_inputs.settings,
-        list[ChangedValues](),
-    )
-    for name in (gate, *PARAMETERS_SET_TO_DEFAULT):
-        default, value = log.find_default_value(name), logged_parameters.get(name, np.nan)
+    gate_parameter = ekf2_inputs.aid.gate
+    changes = list[ChangedValues]()
+    for name in (gate_parameter, *PARAMETERS_SET_TO_DEFAULT):
+        default, value = log.find_default_value(name), ekf2_inputs.settings.get(name, np.nan)
+        # Only a gate that is too small affects a consistent filter: it rejects normal positions
+        if name == gate_parameter and value > default:
+            continue
         # A missing parameter is NaN. Comparisons with NaN are False, so it is not changed
-        if abs(value - default) > 1e-3 * abs(default) and (name != gate or value < default):
+        if abs(value - default) > 1e-3 * abs(default):
             changes.append({name: default})
     return changes
 

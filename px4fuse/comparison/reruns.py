@@ -5,7 +5,7 @@ If no single change is sufficient, the best change is combined with each other c
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from itertools import chain
 from typing import Any, NamedTuple, TypeGuard
 
@@ -96,12 +96,16 @@ def find_error_above_sigma(summary: FilterSummary | UntestedFilter) -> ErrorAbov
     if isinstance(truth, Unavailable):
         return None
     nis_mean = None if isinstance(summary, Unavailable) else summary.nis_mean
-    nees, rmse_m = truth.nees_position_mean or 0.0, truth.position_rmse_m
-    # The NEES at the fusion horizon contains no errors due to the lag of the output predictor
-    fusion_horizon_nees = truth.nees_position_horizon_mean or nees
-    if min(nees, fusion_horizon_nees) < MIN_REPORTED_NEES or (nis_mean or 0.0) >= MAX_NORMAL_NIS:
+    if nis_mean is not None and nis_mean >= MAX_NORMAL_NIS:
         return None
-    reported_sigma_m = summary.sigma_p_median_m or rmse_m / float(np.sqrt(nees))
+    # An error due only to the lag of the output predictor does not count. The NEES at the fusion
+    # horizon, if logged, does not contain this lag
+    nees, rmse_m = truth.nees_position_mean or 0.0, truth.position_rmse_m
+    fusion_horizon_nees = truth.nees_position_horizon_mean or nees
+    if min(nees, fusion_horizon_nees) < MIN_REPORTED_NEES:
+        return None
+    # Without a median of the reported σ: NEES = (error / σ)²
+    reported_sigma_m = summary.sigma_p_median_m or rmse_m / nees**0.5
     return ErrorAboveSigma(nees, rmse_m, reported_sigma_m, nis_mean)
 
 
@@ -148,22 +152,28 @@ def rerun_filters(
         and model.agreement.good
         and is_source_fused(comparison, model.inputs)
     ):
-        replays: dict[frozenset[tuple[str, float]], Ekf2Replay] = {}
+
+        @cache  # one replay of each change for all axes; only hashable arguments can be cached
+        def replay_ekf2(change_items: frozenset[tuple[str, float]]) -> Ekf2Replay:
+            return _replay_ekf2(comparison, estimates.tuning, model, dict(change_items))
 
         def rerun_ekf2(axis_result: AxisComparison, change: ChangedValues) -> RunStatistics:
-            change_key = frozenset(change.items())
-            if change_key not in replays:
-                replays[change_key] = _replay_ekf2(comparison, estimates.tuning, model, change)
-            return _summarise_replay(comparison, model, replays[change_key], axis_result, change)
+            ekf2_replay = replay_ekf2(frozenset(change.items()))
+            return _summarise_replay(comparison, model, ekf2_replay, axis_result, change)
 
-        evaluated_spans_s = model.baseline_replay.find_evaluated_spans()
-        filters.append(_Filter("ekf2", rerun_ekf2, model.inputs, evaluated_spans_s))
-    return tuple(
-        rerun
-        for tested_filter in filters
-        for axis_result in comparison.axes.values()
-        for rerun in _rerun_with_changes(comparison, estimates, tested_filter, axis_result)
-    )
+        filters.append(
+            _Filter(
+                "ekf2",
+                rerun_ekf2,
+                ekf2_inputs=model.inputs,
+                evaluated_spans_s=model.baseline_replay.find_evaluated_spans(),
+            )
+        )
+    reruns: list[Rerun] = []
+    for tested_filter in filters:
+        for axis_result in comparison.axes.values():
+            reruns += _rerun_with_changes(comparison, estimates, tested_filter, axis_result)
+    return tuple(reruns)
 
 
 def rerun_kf_with_time_offset(prepared: PreparedComparison, time_offset: SourceTimeOffset) -> Rerun:
@@ -214,21 +224,26 @@ def _find_changes_to_test(
     summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
     if not isinstance(summary, FilterSummary) or (ekf2_inputs is not None and axis == "down"):
         return []  # EKF2's replay contains no vertical position
+    # Statistics that are wrong, and the changes that may correct each of them
     statistics: list[Statistic] = ["nees"] if find_error_above_sigma(summary) else []
     if is_inconsistent(summary):
         statistics.append("nis")
-    candidates = {
+    changes_by_statistic = {
         statistic: find_candidate_changes(
             comparison, estimates, ekf2_inputs, axis, summary, statistic
         )
         for statistic in statistics
     }
-    if axis_result is not comparison.main:
-        changes = remove_repeated_changes(chain.from_iterable(candidates.values()))
-    else:
+    # Along the axis of largest motion, changes are also tested if no statistic is wrong
+    if axis_result is comparison.main:
         changes = find_main_axis_changes(comparison, estimates, ekf2_inputs, axis, summary)
+    else:
+        changes = remove_repeated_changes(chain.from_iterable(changes_by_statistic.values()))
     return [
-        (change, tuple(statistic for statistic in statistics if change in candidates[statistic]))
+        (
+            change,
+            tuple(name for name, corrections in changes_by_statistic.items() if change in corrections),
+        )
         for change in changes
     ]
 
@@ -337,27 +352,34 @@ def _rotate_direction(direction: Array, rotation_deg: float) -> Array:
 def _rerun_kf(
     comparison: Comparison, tuning: TuningByAxis, axis_result: AxisComparison, change: ChangedValues
 ) -> RunStatistics:
+    """Run KF along an axis with a change of its settings or of its data, and summarise the run."""
     axis, truth, ekf2_state = axis_result.axis, axis_result.truth, axis_result.ekf2_tracks.state
+    # The corrected time offset (clock_offset_s) is also a setting of KF
     kf_settings: dict[str, Any] = {
         name: change[name] for name in change if name in vars(Settings())
     }
     changed_settings = replace(comparison.settings, **kf_settings)
-    # Apply the corrections of the data in sequence: rotation, bias, outliers, time offset
+    # Apply the corrections of the data in sequence. 1. Rotation of the positions: project them onto
+    # the axis rotated in the opposite direction
     rotates_gnss_positions = ROTATION_KEY in change and comparison.source.origin.is_gnss
     if ROTATION_KEY in change:
         rotated_direction = _rotate_direction(axis.direction, change[ROTATION_KEY])
         measured_m = weighted_sum(comparison.source_samples, Columns.POSITION, rotated_direction)
         axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
         if rotates_gnss_positions:
-            # Rotating positions and ground truth has the same effect as correcting the heading
+            # GNSS positions are right, but the heading of KF's acceleration is wrong. Rotating
+            # positions and ground truth has the same effect as correcting the heading
             rotated_axis = replace(axis, direction=rotated_direction)
             truth = project_truth(comparison.flight.truth, rotated_axis, comparison.segment)
+    # 2. Accelerometer bias
     if FORWARD_BIAS_KEY in change:
         axis = replace(axis, acceleration=_remove_accelerometer_bias(comparison, change))
+    # 3. Outliers
     time_s, axis_tuning = axis.measurement_time_s, find_axis_tuning(tuning, axis.name)
     is_used = np.ones(len(time_s), dtype=bool)
     if OUTLIERS_KEY in change and axis_tuning is not None:
         is_used = ~np.isin(time_s, axis_tuning.outlier_time_s)
+    # 4. Time offset: the timestamps already contain the offset of the original run
     shift_s = changed_settings.clock_offset_s - comparison.settings.clock_offset_s
     axis = replace(
         axis,
@@ -392,21 +414,21 @@ def _replay_ekf2(
 ) -> Ekf2Replay:
     if not change:
         return model.baseline_replay
+    # A change contains parameters of EKF2, and corrections of the positions under other names
     changed_parameters = {name: value for name, value in change.items() if name in MODEL_PARAMETERS}
-    model_with_moved_positions = misalign_positions(
-        model, change.get(ROTATION_KEY, 0.0), change.get(TIME_OFFSET_KEY, 0.0)
-    )
-    # Convert the outlier times from KF's timestamps to those of the replay: without KF's time
-    # offset, with the tested time offset, and for GNSS with the delay that KF subtracts
+    time_offset_s = change.get(TIME_OFFSET_KEY, 0.0)
+    model = misalign_positions(model, change.get(ROTATION_KEY, 0.0), time_offset_s)
     excluded_times_s, axis_tuning = None, find_axis_tuning(tuning, HORIZONTAL)
     if OUTLIERS_KEY in change and axis_tuning is not None:
-        excluded_times_s = axis_tuning.outlier_time_s - comparison.settings.clock_offset_s
+        # Outlier times are KF's timestamps. To find these positions in the replay, remove KF's time
+        # offset, and add the tested offset
+        excluded_times_s = (
+            axis_tuning.outlier_time_s - comparison.settings.clock_offset_s + time_offset_s
+        )
+        # For GNSS, KF's timestamps are earlier by the delay parameter than those of the replay
         if comparison.source.origin.is_fused_as_gnss:
             excluded_times_s += 1e-3 * model.inputs.settings[model.inputs.aid.delay]
-        excluded_times_s += change.get(TIME_OFFSET_KEY, 0.0)
-    (replay,) = replay_with_settings(
-        model_with_moved_positions, [changed_parameters], excluded_times_s
-    )
+    (replay,) = replay_with_settings(model, [changed_parameters], excluded_times_s)
     return replay
 
 
@@ -424,8 +446,9 @@ def _summarise_replay(
     evaluated_spans_s, axis = model.baseline_replay.find_evaluated_spans(), axis_result.axis
     if ROTATION_KEY in change and comparison.source.origin.is_gnss:
         # The re-run rotates the GNSS positions, and with them EKF2's frame. Rotate the axis by the
-        # same angle (clockwise: a negative angle in _rotate_direction)
+        # same angle: _rotate_direction rotates counter-clockwise
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION_KEY]))
+    # 1. Innovations S, R and P⁺ along the axis, from north and east
     cosines, updates = axis.direction[:2], rows_inside(ekf2_replay.updates, evaluated_spans_s)
     innovation_variance_m2, observation_variance_m2, posterior_variance_m2 = (
         weighted_sum(
@@ -433,7 +456,7 @@ def _summarise_replay(
         )
         for name in ("innovation_variance", "observation_variance", "position_variance")
     )
-    # P⁻ = S - R
+    # 2. Reported position variance, between P⁻ = S - R and P⁺
     prior_variance_m2 = innovation_variance_m2 - observation_variance_m2
     variance_by_time = pd.DataFrame(
         {
@@ -442,6 +465,7 @@ def _summarise_replay(
         },
         index=pd.Index(updates["fused_at_s"].to_numpy()),
     )
+    # 3. Track for the errors against ground truth, and track for the difference to KF
     published_track = project(ekf2_replay.published_state, axis, comparison.segment)
     published_track = rows_inside(published_track, evaluated_spans_s)
     logged_state, track_compared_with_kf = axis_result.ekf2_tracks.state, published_track

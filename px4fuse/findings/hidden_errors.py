@@ -91,7 +91,11 @@ def detect(analysis: Analysis) -> Findings:
 def make_hidden_error_finding(
     analysis: Analysis, errors_not_in_innovations: list[tuple[FilterName, str, ErrorAboveSigma]]
 ) -> Finding:
-    # The main axis first; then the first, largest error of each filter counts
+    """Make the finding on position errors above the reported σ, or on the drift that causes them.
+
+    ``errors_not_in_innovations`` are sorted, the largest first.
+    """
+    # Errors along the main axis first. Of each filter, only the first error is reported
     errors_not_in_innovations = sorted(
         errors_not_in_innovations, key=lambda entry: entry[1] != analysis.main.axis.name
     )
@@ -99,6 +103,7 @@ def make_hidden_error_finding(
     error_by_filter = dict[FilterName, tuple[str, ErrorAboveSigma]]()
     for filter_name, axis, error in errors_not_in_innovations:
         error_by_filter.setdefault(filter_name, (axis, error))
+    # 1. Texts, evidence and cause for each filter
     evidence: dict[str, float | str] = {"axis": worst_axis, "filter": worst_filter}
     ratio_texts, sentences = dict[str, str](), list[str]()
     rerun_by_filter = dict[FilterName, Rerun]()
@@ -122,9 +127,11 @@ def make_hidden_error_finding(
             f"{analysis.axes[axis].axis.label}, reported σ "
             f"{format_metres(error.reported_sigma_m)} m."
         )
-    # The cause of the worst error or, without it, that of the other filter's error
-    cause = rerun_by_filter.get(worst_filter) or next(iter(rerun_by_filter.values()), None)
+    # 2. The cause of the worst error or, without it, that of the other filter's error
+    causes = [rerun_by_filter.get(worst_filter), *rerun_by_filter.values()]
+    cause = next(filter(None, causes), None)
     evidence[CAUSE_KEY] = classify_cause(analysis, cause)
+    # 3. Without a cause, test if an alignment with ground truth removes most of the error
     is_misaligned = False
     rmse_text = f"position RMSE {format_metres(worst_error.rmse_m)} m against ground truth"
     if cause is None and (alignment_rmse := _compute_alignment_rmse(analysis, worst_filter)):
@@ -138,7 +145,7 @@ def make_hidden_error_finding(
             "position_rmse_aligned_m": after_m,
         }
         is_misaligned = after_m < MAX_ALIGNED_TO_UNALIGNED_RMSE_RATIO * before_m
-    kf_errors = analysis.axes[worst_axis].filters["kf"].truth
+    # 4. Remedy, in the order of certainty
     if cause is not None:
         remedy = format_action(analysis, cause.change)
     elif is_misaligned:
@@ -146,20 +153,11 @@ def make_hidden_error_finding(
         remedy = FRAME_REMEDY
     elif analysis.source.origin.may_drift:
         return _make_drift_finding(analysis, rmse_text, evidence, tuple(ratio_texts))
-    elif (
-        error_by_filter.keys() == {"ekf2"}
-        and isinstance(kf_errors, ErrorsAgainstTruth)
-        and kf_errors.position_rmse_m < MAX_KF_TO_EKF2_RMSE_RATIO * worst_error.rmse_m
-    ):
-        remedy = EKF2_HEIGHT_REMEDY if worst_axis == "down" else EKF2_REMEDY
     else:
-        remedy = "Check the time offset of the positions (px4fuse sync LOG)."
-        if isinstance(analysis.time_offset, Unavailable):
-            remedy = (
-                "A time offset of the positions is possible, but this log cannot show it: "
-                f"{analysis.time_offset.reason}. {analysis.time_offset.remedy}"
-            )
-        remedy += f" {find_source_texts(analysis).slow_error_check}."
+        has_only_ekf2_error = error_by_filter.keys() == {"ekf2"}
+        remedy = _find_remedy_of_unknown_cause(
+            analysis, worst_axis, worst_error, has_only_ekf2_error=has_only_ekf2_error
+        )
     return finding(
         error_if(worst_error.nees >= MIN_NEES_FOR_SEVERITY_ERROR),
         "error_exceeds_reported_sigma",
@@ -168,6 +166,26 @@ def make_hidden_error_finding(
         remedy,
         evidence,
     )
+
+
+def _find_remedy_of_unknown_cause(
+    analysis: Analysis, axis: str, error: ErrorAboveSigma, *, has_only_ekf2_error: bool
+) -> str:
+    kf_errors = analysis.axes[axis].filters["kf"].truth
+    # KF uses the same positions: if its error is smaller, the fault is in EKF2
+    if (
+        has_only_ekf2_error
+        and isinstance(kf_errors, ErrorsAgainstTruth)
+        and kf_errors.position_rmse_m < MAX_KF_TO_EKF2_RMSE_RATIO * error.rmse_m
+    ):
+        return EKF2_HEIGHT_REMEDY if axis == "down" else EKF2_REMEDY
+    remedy = "Check the time offset of the positions (px4fuse sync LOG)."
+    if isinstance(analysis.time_offset, Unavailable):
+        remedy = (
+            "A time offset of the positions is possible, but this log cannot show it: "
+            f"{analysis.time_offset.reason}. {analysis.time_offset.remedy}"
+        )
+    return f"{remedy} {find_source_texts(analysis).slow_error_check}."
 
 
 def _make_drift_finding(
