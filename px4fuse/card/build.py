@@ -540,11 +540,12 @@ def _explain_differing_verdicts(
             "KF and EKF2 follow position errors that change slowly. Only ground truth shows slow "
             "errors."
         )
+    explanation = UNEXPLAINED_DIFFERENCE_TEXT
     if "source_outliers" in finding_ids and "ekf2" in filters_with_differing_ratios:
-        return OUTLIER_EXPLANATION
-    if "ekf2_heading_error" in finding_ids:
-        return HEADING_ERROR_EXPLANATION
-    return UNEXPLAINED_DIFFERENCE_TEXT
+        explanation = OUTLIER_EXPLANATION
+    elif "ekf2_heading_error" in finding_ids:
+        explanation = HEADING_ERROR_EXPLANATION
+    return explanation
 
 
 def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCause]) -> str:
@@ -632,9 +633,7 @@ def _format_changed_parameters(analysis: Analysis) -> tuple[str, ...]:
     log, parameter_texts = analysis.flight.log, []
     for name in (aid.noise, aid.delay, aid.gate):
         value, default = log.parameters.get(name), log.find_default_value(name)
-        if value is None or name not in MODEL_PARAMETERS:
-            continue
-        if not math.isclose(value, default, rel_tol=1e-3):
+        if value is not None and not math.isclose(value, default, rel_tol=1e-3):
             value_text = f"{name} {value:.4g} {MODEL_PARAMETERS[name].unit}".rstrip()
             parameter_texts.append(f"{value_text} (PX4 default {default:g})")
     return tuple(parameter_texts)

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
-from enum import IntEnum
 from typing import NamedTuple
 
 from msgspec import structs
@@ -70,27 +69,19 @@ ACTION_TARGET_BY_FINDING_ID: Mapping[str, ActionTarget] = {
 }
 
 
-class CauseRank(IntEnum):
-    """Importance of a possible cause, the most important first."""
-
-    MAKES_RESULTS_MEANINGLESS = 0
-    RERUN_IS_CONSISTENT = 1  # a re-run without the fault makes a filter consistent
-    RERUN_IS_BETTER = 2  # a re-run without the fault halves the deviation of the reported σ
-    ERROR = 3
-    WARNING = 4
-
-
 class RankedCause(NamedTuple):
     """Finding that may be the cause of an inconsistent filter, and the re-runs that test it.
 
     Attributes
     ----------
+    rank : int
+        Importance: 0 for the most important causes, 4 for the least important causes.
     log_sigma_ratio_reduction : float
         Decrease of |ln(actual σ ÷ reported σ)|, summed over the re-runs.
     """
 
     finding: Finding
-    rank: CauseRank
+    rank: int
     log_sigma_ratio_reduction: float
     reruns: tuple[Rerun, ...]
 
@@ -118,8 +109,8 @@ def rank_causes(analysis: Analysis, cause_findings: Sequence[Finding]) -> list[R
         key=lambda cause: (
             cause.rank,
             # faults of the source first: a changed setting may only hide them. This order does not
-            # apply to warnings without a helpful re-run
-            cause.rank != CauseRank.WARNING and _is_setting_fault(cause.finding),
+            # apply to warnings without a helpful re-run (rank 4)
+            cause.rank < 4 and _is_setting_fault(cause.finding),
             -cause.log_sigma_ratio_reduction,
         ),
     )
@@ -130,21 +121,26 @@ def _is_setting_fault(finding: Finding) -> bool:
     return bool(rerun_kinds) and rerun_kinds <= SETTING_CHANGE_KINDS
 
 
-def _find_cause_rank(finding: Finding, reruns: Sequence[Rerun]) -> CauseRank:
+def _find_cause_rank(finding: Finding, reruns: Sequence[Rerun]) -> int:
+    """Return the importance of a possible cause.
+
+    0 faults that make all results meaningless, 1 a re-run without the fault makes a filter
+    consistent, 2 a re-run halves the deviation of the reported σ, 3 other errors, 4 other warnings.
+    """
     if (
         FINDING_CATALOGUE[finding.id].verdict == "meaningless"
         or WRONG_CONVENTION_KEY in finding.evidence
     ):
-        return CauseRank.MAKES_RESULTS_MEANINGLESS
+        return 0
     # A changed setting that leaves a filter overconfident is not the main cause, although its
     # re-run may make another ratio consistent
     if _is_setting_fault(finding) and any(map(remains_overconfident, reruns)):
-        return CauseRank.ERROR
+        return 3
     if any(map(becomes_consistent, reruns)):
-        return CauseRank.RERUN_IS_CONSISTENT
+        return 1
     if any(map(halves_discrepancy, reruns)):
-        return CauseRank.RERUN_IS_BETTER
-    return CauseRank.ERROR if finding.severity == "error" else CauseRank.WARNING
+        return 2
+    return 3 if finding.severity == "error" else 4
 
 
 def find_reruns_of_finding(reruns: Iterable[Rerun], finding: Finding) -> tuple[Rerun, ...]:

@@ -23,7 +23,6 @@ from .remedy import (
 )
 from .rerun_effects import (
     CHANGE_KEYS_WITHOUT_EFFECT_ALONE,
-    CONSISTENCY_STATISTICS,
     FORWARD_BIAS_KEY,
     OUTLIERS_KEY,
     RIGHT_BIAS_KEY,
@@ -117,39 +116,24 @@ def find_candidate_changes(
     return changes
 
 
-def find_main_axis_changes(
+def find_additional_changes(
     comparison: Comparison,
     estimates: Estimates,
     ekf2_inputs: ReplayInputs | None,
-    axis: str,
-    summary: FilterSummary,
+    changes: list[ChangedValues],
 ) -> list[ChangedValues]:
-    """Return the changes of settings or data for re-runs along the axis of largest motion.
-
-    The report shows their effect also if the filter is consistent.
-    """
-    # Changes for the mean NIS are first: the report shows the re-runs in this order
-    changes = remove_repeated_changes(
-        change
-        for statistic in reversed(CONSISTENCY_STATISTICS)
-        for change in find_candidate_changes(
-            comparison, estimates, ekf2_inputs, axis, summary, statistic
-        )
-    )
+    """Return the changes to test in addition to ``changes`` along the axis of largest motion."""
     if ekf2_inputs is not None:
         # The user can correct a late EKF2 track by the delay parameter or, alternatively, by the
         # timestamps. find_candidate_changes returns only one of these changes: test the other, too
-        if any(ekf2_inputs.aid.delay in change for change in changes):
-            changes += _find_offset_changes(estimates, ekf2_inputs)
-        return remove_repeated_changes(changes)
+        is_delay_tested = any(ekf2_inputs.aid.delay in change for change in changes)
+        return _find_offset_changes(estimates, ekf2_inputs) if is_delay_tested else []
     # For KF, also test both noises together, and the default settings
     noise_changes = [change for change in changes if change.keys() <= KF_NOISE_SETTINGS]
-    if len(noise_changes) > 1:
-        changes.append({name: value for change in noise_changes for name, value in change.items()})
-    default_settings = find_default_settings(comparison)
-    if default_settings and noise_changes:
-        changes.append(default_settings)
-    return changes
+    if not noise_changes:
+        return []
+    both_noises = {name: value for change in noise_changes for name, value in change.items()}
+    return [change for change in (both_noises, find_default_settings(comparison)) if change]
 
 
 def remove_repeated_changes(changes: Iterable[ChangedValues]) -> list[ChangedValues]:

@@ -163,8 +163,9 @@ def _summarise_filter(
     if isinstance(innovations, Unavailable):
         summary = innovations
     else:
+        innovation_m, variance_m2 = innovations[INNOVATION_COLUMNS].to_numpy().T
         summary = FilterSummary.from_innovations(
-            *innovations[INNOVATION_COLUMNS].to_numpy().T, tracks.gate, **common_fields
+            innovation_m, variance_m2, tracks.gate, **common_fields
         )
     if isinstance(summary, Unavailable):
         return UntestedFilter(**structs.asdict(summary), **common_fields)

@@ -261,9 +261,7 @@ def _compute_interpolation_weights(time_s: Array, interval_s: float) -> tuple[Ar
     rows = np.arange(2, len(time_s) - 2)
     neighbour_rows = rows[:, None] + NEIGHBOUR_ROW_OFFSETS
     elapsed_intervals = (time_s[neighbour_rows] - time_s[rows, None]) / interval_s
-    is_without_gap = (
-        np.ptp(elapsed_intervals, axis=1) < MAX_NEIGHBOUR_TIME_SPAN_IN_MEDIAN_INTERVALS
-    )
+    is_without_gap = np.ptp(elapsed_intervals, axis=1) < MAX_NEIGHBOUR_TIME_SPAN_IN_MEDIAN_INTERVALS
     # powers[row, k, neighbour] = tᵏ, so powers @ w = (1, 0, 0, 0): w is column 0 of the inverse
     powers = elapsed_intervals[is_without_gap, None] ** np.arange(4)[:, None]
     return rows[is_without_gap], np.linalg.inv(powers)[:, :, 0]
@@ -307,16 +305,14 @@ def find_speed_dependent_noise(errors: LocalResiduals) -> SpeedDependentNoise | 
     # Constant values have no rank correlation
     if not np.all([np.ptp(part, axis=0) for part in flight_parts]):
         return None
-
-    def compute_correlation_in_sigmas(part: Array) -> float:
-        # σ of the correlation of n independent values without relation is 1 / √n
-        independent_count = len(part) / RESIDUAL_CORRELATION_LENGTH
-        return rank_correlation(*part.T) * float(np.sqrt(independent_count))
-
-    median_of_parts = np.median([*map(compute_correlation_in_sigmas, flight_parts)])
+    # Correlations ÷ σ, which is 1 / √n for n independent values without relation
+    flight_z_score, *part_z_scores = (
+        rank_correlation(*part.T) * np.sqrt(len(part) / RESIDUAL_CORRELATION_LENGTH)
+        for part in (norms_and_speeds, *flight_parts)
+    )
     if (
-        compute_correlation_in_sigmas(norms_and_speeds) < MIN_SIGNIFICANCE_SIGMAS
-        or median_of_parts < MIN_NOISE_SPEED_CORRELATION_SIGMAS
+        flight_z_score < MIN_SIGNIFICANCE_SIGMAS
+        or np.median(part_z_scores) < MIN_NOISE_SPEED_CORRELATION_SIGMAS
     ):
         return None
     # 2. The noise must be larger in fast than in slow flight, along and across the track. Jitter of
@@ -353,8 +349,8 @@ def fit_errors_against_truth(
 ) -> ErrorFit | None:
     """Fit constant offset, scale, rotation and time offset to the errors against ground truth.
 
-    Model: error = offset + scale · path + rotation · (path rotated by 90°) - velocity · time offset,
-    for small errors; path is the true position minus its mean.
+    Model for small errors: error = offset + scale · path + rotation · (path rotated by 90°) -
+    velocity · time offset; path is the true position minus its mean.
     """
     truth = comparison.flight.truth
     if isinstance(truth, Unavailable):
@@ -501,7 +497,8 @@ def find_time_offset_variation(fit: ErrorFit) -> TimeOffsetVariation | None:
         error_per_time_offset_m_s[:, :, None] * time_offsets_by_column_s[flight_part_indices, None]
     )
     parameters, residual_m = _fit_least_squares(columns[..., :-1], columns[..., -1])
-    # Time offsets of (errors - columns · p), that is, of what the constant parameters do not explain
+    # Time offsets of (errors - columns · p), that is, of what the constant parameters do not
+    # explain
     offsets_s = (time_offsets_by_column_s @ np.append(-parameters, 1.0))[moving_part_indices]
     white_noise_mean_square_m2 = 2.0 * fit.white_noise_sigma_m**2  # of two axes
     slow_error_m2 = fit.compute_slow_error_mean_square_m2()
@@ -514,9 +511,7 @@ def find_time_offset_variation(fit: ErrorFit) -> TimeOffsetVariation | None:
         return None
     times_s = fit.time_s[0] + FLIGHT_PART_DURATION_FOR_OFFSET_S * (moving_part_indices + 0.5)
     least, most = np.argmin(offsets_s), np.argmax(offsets_s)
-    return TimeOffsetVariation(
-        *offsets_s[[least, most]].tolist(), *times_s[[least, most]].tolist()
-    )
+    return TimeOffsetVariation(*offsets_s[[least, most]].tolist(), *times_s[[least, most]].tolist())
 
 
 def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | None:

@@ -308,8 +308,8 @@ def _fit_source_errors(
             correlated_noise,
             source_low_pass,
         )
-    # 4. Withdraw a low-pass filter that an oscillation of the IMU imitates. A real filter would pass
-    # the oscillation to the positions if its lag is short: 2π · frequency · lag < 1
+    # 4. Withdraw a low-pass filter that an oscillation of the IMU imitates. A real filter would
+    # pass the oscillation to the positions if its lag is short: 2π · frequency · lag < 1
     if oscillation is not None and (
         2.0 * np.pi * oscillation.frequency_hz * source_low_pass.lag_s < 1.0
     ):

@@ -77,9 +77,9 @@ def _find_heading_of_largest_noise(north_and_east: Sequence[AxisComparison]) -> 
     correlation = np.sin(0.5 * np.pi * np.sign(innovation_changes_m).prod(axis=1).mean())
     if abs(correlation) * np.sqrt(len(innovation_changes_m)) < MIN_CORRELATION_SIGMAS:
         return None
-    # Direction of largest variance (principal axis) of a covariance matrix with σ of north and east:
-    # tan(2 · heading) = 2 · correlation · σ_north · σ_east / (σ_north² - σ_east²). The median of the
-    # absolute values is proportional to σ, and insensitive to outliers
+    # Direction of largest variance (principal axis) of a covariance matrix with σ of north and
+    # east: tan(2 · heading) = 2 · correlation · σ_north · σ_east / (σ_north² - σ_east²). The median
+    # of the absolute values is proportional to σ, and insensitive to outliers
     north_m, east_m = np.median(np.abs(innovation_changes_m), axis=0)
     double_angle_rad = np.arctan2(2.0 * correlation * north_m * east_m, north_m**2 - east_m**2)
     return float(np.degrees(0.5 * double_angle_rad)) % 180.0

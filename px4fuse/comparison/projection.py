@@ -55,8 +55,8 @@ def remove_origin_resets(
         reset for reset in ekf2.resets if segment.start_s < reset.time_s <= segment.end_s
     ]
     state = ekf2.state.copy() if resets_in_segment else ekf2.state
-    # Number of resets of each quantity, for example "2 of height"
-    removed_counts, kept_counts = list[str](), list[str]()
+    # Number of resets of each quantity that are removed or kept, for example "2 of height"
+    removed_texts, kept_texts = list[str](), list[str]()
     for label, quantity, columns in (
         ("horizontal position", "position", Columns.POSITION[:2]),
         ("height", "position", Columns.POSITION[2:]),
@@ -71,34 +71,29 @@ def remove_origin_resets(
         ]
         if not resets:
             continue
-        count_text = f"{len(resets)} of {label}"
-        if quantity == "velocity":  # a velocity does not depend on the origin
-            kept_counts.append(count_text)
-            continue
-        # Without resets of the origin, the track is nearer to the measured positions
-        samples = cut_to_segment(track.samples, segment)[columns].dropna()
-        compute_squared_distance_m2 = partial(_compute_squared_distance_m2, samples)
-        candidates = _make_states_without_resets(ekf2.state[columns], resets, axes)
-        closest_state = min(candidates, key=compute_squared_distance_m2)
-        max_squared_distance_m2 = (
-            MAX_SQUARED_DISTANCE_RATIO_WITHOUT_RESETS * compute_squared_distance_m2(ekf2.state)
-        )
-        if compute_squared_distance_m2(closest_state) < max_squared_distance_m2:
-            state[columns] = closest_state
-            removed_counts.append(count_text)
-        else:
-            kept_counts.append(count_text)
-    statements = []
-    if removed_counts:
-        statements.append(
-            f"Jumps by EKF2 resets ({', '.join(removed_counts)}) are removed from EKF2's track: "
-            "the resets only move the origin of EKF2's frame"
-        )
-    if kept_counts:
-        statements.append(
-            f"Jumps by EKF2 resets ({', '.join(kept_counts)}) are kept: the resets correct an "
-            "error of EKF2"
-        )
+        has_only_moved_origin = False
+        if quantity == "position":  # a velocity does not depend on the origin
+            # Without resets of the origin, the track is nearer to the measured positions
+            samples = cut_to_segment(track.samples, segment)[columns].dropna()
+            compute_squared_distance_m2 = partial(_compute_squared_distance_m2, samples)
+            candidates = _make_states_without_resets(ekf2.state[columns], resets, axes)
+            closest_state = min(candidates, key=compute_squared_distance_m2)
+            has_only_moved_origin = compute_squared_distance_m2(
+                closest_state
+            ) < MAX_SQUARED_DISTANCE_RATIO_WITHOUT_RESETS * compute_squared_distance_m2(ekf2.state)
+            if has_only_moved_origin:
+                state[columns] = closest_state
+        texts = removed_texts if has_only_moved_origin else kept_texts
+        texts.append(f"{len(resets)} of {label}")
+    treatments = {
+        "removed from EKF2's track: the resets only move the origin of EKF2's frame": removed_texts,
+        "kept: the resets correct an error of EKF2": kept_texts,
+    }
+    statements = (
+        f"Jumps by EKF2 resets ({', '.join(texts)}) are {treatment}"
+        for treatment, texts in treatments.items()
+        if texts
+    )
     return state, ". ".join(statements)
 
 
@@ -192,7 +187,8 @@ def project_fusion_horizon_position(
 def _find_altitude_offset_m(ekf2: Ekf2, down_m: pd.Series) -> float:
     """Return the altitude (m) of EKF2's origin if logged heights are altitudes, else 0.
 
-    ``down_m`` are the logged heights: down from the origin, or negative altitudes. Since PX4 v1.16, EKF2 fuses altitudes above sea level as soon as it has an origin.
+    ``down_m`` are the logged heights: down from the origin, or negative altitudes. Since PX4
+    v1.16, EKF2 fuses altitudes above sea level as soon as it has an origin.
     """
     published_down_m = np.interp(down_m.index, ekf2.state.index, ekf2.state["down_m"])
     altitude_m = 0.0 if isinstance(ekf2.record, Unavailable) else ekf2.record.altitude_m

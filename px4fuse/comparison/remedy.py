@@ -79,7 +79,8 @@ def estimate_gnss_delay_ms(
         # The number of updates depends on the delay. To compare the replays, scale the mean NIS to
         # the number of received positions (each with the NIS of 2 axes · position and velocity)
         nis_sums.append(float(np.mean(nis)) * len(nis) * len(received_positions.timestamp_s))
-    # Normal distribution: NIS sum = -2 ln p = (delay - estimate)² / σ² + constant. Fit this parabola
+    # Normal distribution: NIS sum = -2 ln p = (delay - estimate)² / σ² + constant. Fit this
+    # parabola
     quadratic_coefficient, linear_coefficient, _ = np.polyfit(GNSS_DELAYS_MS, nis_sums, 2)
     if quadratic_coefficient <= 0.0:
         return None

@@ -190,16 +190,14 @@ def find_cause_rerun(
 
 def find_partial_corrections(reruns: Iterable[Rerun], statistic: Statistic) -> list[Rerun]:
     """Return the re-runs that correct a statistic only partly, best first."""
-
-    def compute_error(rerun: Rerun) -> float:
-        return _compute_explained_fraction_error(rerun, statistic)
-
     candidates = [
         rerun
-        for rerun in sorted(reruns, key=compute_error)
+        for rerun in reruns
         if statistic in rerun.discrepancies
-        and compute_error(rerun) < COMBINED_CHANGE_EXPLAINED_FRACTION_TOLERANCE
+        and _compute_explained_fraction_error(rerun, statistic)
+        < COMBINED_CHANGE_EXPLAINED_FRACTION_TOLERANCE
     ]
+    candidates.sort(key=lambda rerun: _compute_explained_fraction_error(rerun, statistic))
     return [] if any(brings_inside_limits(rerun, statistic) for rerun in candidates) else candidates
 
 

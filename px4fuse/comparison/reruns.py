@@ -6,7 +6,6 @@ If no single change is sufficient, the best change is combined with each other c
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from itertools import chain
 from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
@@ -34,9 +33,9 @@ from px4fuse.flight.model import Columns, Spans, Unavailable
 
 from .changes import (
     classify_change,
+    find_additional_changes,
     find_axis_tuning,
     find_candidate_changes,
-    find_main_axis_changes,
     remove_repeated_changes,
 )
 from .comparison import (
@@ -52,7 +51,6 @@ from .model import (
     Comparison,
     ErrorsAgainstTruth,
     FilterDifference,
-    FilterName,
     FilterSummary,
     PreparedComparison,
     UntestedFilter,
@@ -128,16 +126,6 @@ class Reruns:
     reruns: tuple[Rerun, ...]
 
 
-class _Filter(NamedTuple):
-    """KF or EKF2, and a function that re-runs the filter with a change."""
-
-    name: FilterName
-    rerun: Callable[[AxisComparison, ChangedValues], RunStatistics]
-    # For EKF2 only: inputs of the replay, and evaluated time spans (s)
-    ekf2_inputs: ReplayInputs | None = None
-    evaluated_spans_s: Spans | None = None
-
-
 def rerun_filters(
     comparison: Comparison, estimates: Estimates, model: Ekf2Model | Unavailable
 ) -> tuple[Rerun, ...]:
@@ -146,7 +134,12 @@ def rerun_filters(
     EKF2 is re-run only if its replay agrees with the log, and only once for each change, because a
     replay contains all axes.
     """
-    filters = [_Filter("kf", partial(_rerun_kf, comparison, estimates.tuning))]
+    rerun_kf = partial(_rerun_kf, comparison, estimates.tuning)
+    reruns = [
+        rerun
+        for axis_result in comparison.axes.values()
+        for rerun in _rerun_with_changes(comparison, estimates, axis_result, rerun_kf)
+    ]
     if (
         isinstance(model, Ekf2Model)
         and model.agreement.good
@@ -161,18 +154,8 @@ def rerun_filters(
             ekf2_replay = replay_ekf2(frozenset(change.items()))
             return _summarise_replay(comparison, model, ekf2_replay, axis_result, change)
 
-        filters.append(
-            _Filter(
-                "ekf2",
-                rerun_ekf2,
-                ekf2_inputs=model.inputs,
-                evaluated_spans_s=model.baseline_replay.find_evaluated_spans(),
-            )
-        )
-    reruns: list[Rerun] = []
-    for tested_filter in filters:
         for axis_result in comparison.axes.values():
-            reruns += _rerun_with_changes(comparison, estimates, tested_filter, axis_result)
+            reruns += _rerun_with_changes(comparison, estimates, axis_result, rerun_ekf2, model)
     return tuple(reruns)
 
 
@@ -224,48 +207,55 @@ def _find_changes_to_test(
     summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
     if not isinstance(summary, FilterSummary) or (ekf2_inputs is not None and axis == "down"):
         return []  # EKF2's replay contains no vertical position
-    # Statistics that are wrong, and the changes that may correct each of them
-    statistics: list[Statistic] = ["nees"] if find_error_above_sigma(summary) else []
-    if is_inconsistent(summary):
-        statistics.append("nis")
-    changes_by_statistic = {
+    candidates = {
         statistic: find_candidate_changes(
             comparison, estimates, ekf2_inputs, axis, summary, statistic
         )
-        for statistic in statistics
+        for statistic in CONSISTENCY_STATISTICS
     }
-    # Along the axis of largest motion, changes are also tested if no statistic is wrong
+    # Statistics that are wrong
+    statistics: list[Statistic] = ["nees"] if find_error_above_sigma(summary) else []
+    if is_inconsistent(summary):
+        statistics.append("nis")
     if axis_result is comparison.main:
-        changes = find_main_axis_changes(comparison, estimates, ekf2_inputs, axis, summary)
+        # Changes are also tested if no statistic is wrong. Those for the mean NIS are first
+        changes = [*candidates["nis"], *candidates["nees"]]
+        changes += find_additional_changes(comparison, estimates, ekf2_inputs, changes)
     else:
-        changes = remove_repeated_changes(chain.from_iterable(changes_by_statistic.values()))
+        changes = [change for statistic in statistics for change in candidates[statistic]]
     return [
-        (
-            change,
-            tuple(name for name, corrections in changes_by_statistic.items() if change in corrections),
-        )
-        for change in changes
+        (change, tuple(statistic for statistic in statistics if change in candidates[statistic]))
+        for change in remove_repeated_changes(changes)
     ]
 
 
 def _rerun_with_changes(
     comparison: Comparison,
     estimates: Estimates,
-    tested_filter: _Filter,
     axis_result: AxisComparison,
+    rerun_filter: Callable[[AxisComparison, ChangedValues], RunStatistics],
+    model: Ekf2Model | None = None,
 ) -> list[Rerun]:
-    changes = _find_changes_to_test(comparison, estimates, tested_filter.ekf2_inputs, axis_result)
+    """Re-run a filter along an axis with each change to test; ``model`` is None for KF."""
+    ekf2_inputs = None if model is None else model.inputs
+    changes = _find_changes_to_test(comparison, estimates, ekf2_inputs, axis_result)
     if not changes:
         return []
-    original_statistics, is_logged = _find_statistics_of_unchanged_run(tested_filter, axis_result)
-    spans_s = tested_filter.evaluated_spans_s
+    # The re-runs are compared with the original run of KF. Those of EKF2 are compared with the log
+    # or, if the unchanged replay differs too much from the log, with the unchanged replay
+    original_statistics, is_logged, spans_s = rerun_filter(axis_result, {}), True, None
+    if model is not None:
+        spans_s = model.baseline_replay.find_evaluated_spans()
+        logged_statistics = _find_logged_statistics(original_statistics, axis_result, spans_s)
+        is_logged = logged_statistics is not None
+        original_statistics = logged_statistics or original_statistics
 
     def make_rerun(change: ChangedValues, discrepancies: Iterable[Statistic]) -> Rerun:
-        changed_statistics = tested_filter.rerun(axis_result, change)
+        changed_statistics = rerun_filter(axis_result, change)
         return Rerun(
-            filter=tested_filter.name,
+            filter="kf" if model is None else "ekf2",
             axis=axis_result.axis.name,
-            kinds=classify_change(comparison, tested_filter.ekf2_inputs, change),
+            kinds=classify_change(comparison, ekf2_inputs, change),
             change=change,
             discrepancies=tuple(
                 statistic
@@ -289,21 +279,13 @@ def _rerun_with_changes(
     return reruns
 
 
-def _find_statistics_of_unchanged_run(
-    tested_filter: _Filter, axis_result: AxisComparison
-) -> tuple[RunStatistics, bool]:
-    """Return the statistics with which the re-runs of a filter are compared.
-
-    KF: statistics of the original run. EKF2: statistics of the log or, if the unchanged replay
-    differs too much from the log, of the unchanged replay. The second value is False only for
-    statistics of a replay.
-    """
-    replayed, ekf2 = tested_filter.rerun(axis_result, {}), axis_result.ekf2_tracks
-    evaluated_spans_s, innovations = tested_filter.evaluated_spans_s, ekf2.innovations
-    if evaluated_spans_s is None:  # KF
-        return replayed, True
+def _find_logged_statistics(
+    replayed: RunStatistics, axis_result: AxisComparison, evaluated_spans_s: Spans
+) -> RunStatistics | None:
+    """Return the logged statistics of EKF2; None if those of the unchanged replay differ."""
+    ekf2, innovations = axis_result.ekf2_tracks, axis_result.ekf2_tracks.innovations
     if isinstance(ekf2.state, Unavailable) or isinstance(innovations, Unavailable):
-        return replayed, False
+        return None
     logged_state = rows_inside(ekf2.state, evaluated_spans_s)
     innovations = rows_inside(innovations, evaluated_spans_s)
     rejected_flags = innovations["rejected"].dropna()
@@ -324,7 +306,7 @@ def _find_statistics_of_unchanged_run(
         )
         if logged_value is not None
     )
-    return (logged, True) if is_replay_similar else (replayed, False)
+    return logged if is_replay_similar else None
 
 
 def _summarise_run(

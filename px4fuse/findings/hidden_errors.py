@@ -128,8 +128,11 @@ def make_hidden_error_finding(
             f"{format_metres(error.reported_sigma_m)} m."
         )
     # 2. The cause of the worst error or, without it, that of the other filter's error
-    causes = [rerun_by_filter.get(worst_filter), *rerun_by_filter.values()]
-    cause = next(filter(None, causes), None)
+    cause = (
+        rerun_by_filter.get(worst_filter)
+        or rerun_by_filter.get("kf")
+        or rerun_by_filter.get("ekf2")
+    )
     evidence[CAUSE_KEY] = classify_cause(analysis, cause)
     # 3. Without a cause, test if an alignment with ground truth removes most of the error
     is_misaligned = False
@@ -262,7 +265,7 @@ def make_possible_drift_finding(analysis: Analysis) -> Finding:
         "KF and EKF2 follow the drift, so innovations do not show the drift."
     )
     if isinstance(horizontal_tuning, AxisTuning) and (
-        noise_m := horizontal_tuning.sigma_z.value or horizontal_tuning.sigma_z.high
+        noise_m := horizontal_tuning.sigma_z.value_or_bound(0.0)
     ):
         bound_text = "at most " if horizontal_tuning.sigma_z.value is None else ""
         evidence["short_term_noise_m"] = noise_m

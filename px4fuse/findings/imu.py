@@ -190,13 +190,10 @@ def detect_clipping(analysis: Analysis) -> Findings:
 
 def detect_imu_gaps(analysis: Analysis) -> Findings:
     gap_s, imu, log = analysis.main.kf_run.input_gap_s, analysis.flight.imu, analysis.flight.log
-    interval_s, spans = 0.0, tuple[Span, ...]()
-    if not isinstance(imu, Unavailable):
-        interval_s, spans = (
-            1.0 / compute_sample_rate_hz(imu),
-            _find_gap_spans(imu, analysis.segment),
-        )
-    if gap_s > max(MIN_REPORTED_IMU_GAP_S, 2.0 * interval_s):
+    if isinstance(imu, Unavailable):
+        return
+    spans = _find_gap_spans(imu, analysis.segment)
+    if gap_s > max(MIN_REPORTED_IMU_GAP_S, 2.0 / compute_sample_rate_hz(imu)):
         action = ""
         if log.format.startswith("MAVLink"):
             action = "Record on a link without message loss. "

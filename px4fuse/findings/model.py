@@ -237,7 +237,11 @@ def _compute_report_rank(group: list[Finding]) -> int:
     report_class = FINDING_CATALOGUE[cause.id].report_class
     if cause.severity == "note":
         return 5
-    if WRONG_CONVENTION_KEY in cause.evidence or report_class in ("unusable", "misleading", "first"):
+    if WRONG_CONVENTION_KEY in cause.evidence or report_class in (
+        "unusable",
+        "misleading",
+        "first",
+    ):
         return 0
     if cause.severity == "error":
         return 3 if report_class == "noise" else 1
