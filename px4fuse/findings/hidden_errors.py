@@ -149,6 +149,7 @@ def make_hidden_error_finding(
         }
         is_misaligned = after_m < MAX_ALIGNED_TO_UNALIGNED_RMSE_RATIO * before_m
     # 4. Remedy, in the order of certainty
+    kf_errors = analysis.axes[worst_axis].filters["kf"].truth
     if cause is not None:
         remedy = format_action(analysis, cause.change)
     elif is_misaligned:
@@ -156,11 +157,15 @@ def make_hidden_error_finding(
         remedy = FRAME_REMEDY
     elif analysis.source.origin.may_drift:
         return _make_drift_finding(analysis, rmse_text, evidence, tuple(ratio_texts))
+    # KF uses the same positions: if its error is smaller, the fault is in EKF2
+    elif (
+        error_by_filter.keys() == {"ekf2"}
+        and isinstance(kf_errors, ErrorsAgainstTruth)
+        and kf_errors.position_rmse_m < MAX_KF_TO_EKF2_RMSE_RATIO * worst_error.rmse_m
+    ):
+        remedy = EKF2_HEIGHT_REMEDY if worst_axis == "down" else EKF2_REMEDY
     else:
-        has_only_ekf2_error = error_by_filter.keys() == {"ekf2"}
-        remedy = _find_remedy_of_unknown_cause(
-            analysis, worst_axis, worst_error, has_only_ekf2_error=has_only_ekf2_error
-        )
+        remedy = _find_source_remedy(analysis)
     return finding(
         error_if(worst_error.nees >= MIN_NEES_FOR_SEVERITY_ERROR),
         "error_exceeds_reported_sigma",
@@ -171,17 +176,7 @@ def make_hidden_error_finding(
     )
 
 
-def _find_remedy_of_unknown_cause(
-    analysis: Analysis, axis: str, error: ErrorAboveSigma, *, has_only_ekf2_error: bool
-) -> str:
-    kf_errors = analysis.axes[axis].filters["kf"].truth
-    # KF uses the same positions: if its error is smaller, the fault is in EKF2
-    if (
-        has_only_ekf2_error
-        and isinstance(kf_errors, ErrorsAgainstTruth)
-        and kf_errors.position_rmse_m < MAX_KF_TO_EKF2_RMSE_RATIO * error.rmse_m
-    ):
-        return EKF2_HEIGHT_REMEDY if axis == "down" else EKF2_REMEDY
+def _find_source_remedy(analysis: Analysis) -> str:
     remedy = "Check the time offset of the positions (px4fuse sync LOG)."
     if isinstance(analysis.time_offset, Unavailable):
         remedy = (

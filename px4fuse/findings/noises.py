@@ -26,7 +26,6 @@ from px4fuse.comparison.rerun_effects import (
 from px4fuse.comparison.reruns import is_inconsistent
 from px4fuse.core.text import format_factor, format_number, format_ratio
 from px4fuse.filter.settings import SETTING_RANGES, Settings
-from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.finding import SEVERITIES, Finding, Severity
 from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, MODEL_PARAMETERS
@@ -240,9 +239,8 @@ def find_setting_deviation(
 
 def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
     """Detect a SIGMA_A so small that KF ignores new positions."""
-    # The axis of largest motion first. Report only the first axis with this fault
-    other_axes = (result for result in analysis.axes.values() if result is not analysis.main)
-    for result in (analysis.main, *other_axes):
+    # The axis of largest motion is first (False is sorted before True). Report only one axis
+    for result in sorted(analysis.axes.values(), key=lambda result: result is not analysis.main):
         updates, summary = result.kf_run.updates, result.filters["kf"]
         # A small SIGMA_A is wrong only if KF is overconfident and lags: without motion, it is
         # correct
@@ -359,10 +357,7 @@ def _explain_wrong_sigma(
 
 
 def _find_reported_noise_m(analysis: Analysis) -> float:
-    reported_variance = cut_to_segment(analysis.source.samples, analysis.segment)[
-        Columns.POSITION_VARIANCE[0]
-    ]
-    return float(np.sqrt(reported_variance.median()))
+    return float(np.sqrt(analysis.source_samples[Columns.POSITION_VARIANCE[0]].median()))
 
 
 def _format_action_for_excessive_noise(analysis: Analysis) -> str:
