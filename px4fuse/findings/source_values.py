@@ -223,7 +223,7 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
 
 
 def _describe_replayed_effect(
-    analysis: Analysis, change: Mapping[str, float], rotation_deg: float
+    analysis: Analysis, change: Mapping[str, float], rotation_deg: float = 0.0
 ) -> str | None:
     """Describe EKF2's position RMSE in replays without and with a change of a lever arm.
 
