@@ -176,7 +176,7 @@ def select_source_innovations(flight: Flight, track: PositionTrack) -> Flight:
         if not item.source and item not in missing_vision_innovations
     ]
     streams = dict(flight.streams)
-    # GNSS innovations are logged with EKF2's state, in other topics
+    # List the topics of the GNSS innovations as a stream with the properties of EKF2's state
     if "ekf2_state" in streams and ekf2.aids:
         streams["ekf2_innovations"] = replace(streams["ekf2_state"], topics=ekf2.innovation_topics)
     missing_data = (*other_missing_data, *missing_gnss_innovations)

@@ -135,7 +135,7 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
             continue
         if may_setting_exceed_estimate and setting >= deviation.estimate:
             continue
-        # The estimates of a drifting source are less accurate: report only large deviations
+        # For a source that may drift, report only large deviations
         if may_drift and deviation.severity == "note":
             continue
         setting_finding = _make_setting_finding(analysis, axis_tuning, name, noise, deviation)

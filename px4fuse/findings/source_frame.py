@@ -101,7 +101,7 @@ def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Find
     if source.origin.is_gnss:
         reason = "GNSS positions refer to true north, so EKF2's heading is wrong by this rotation."
         _, action = _explain_gnss_heading_error(analysis)
-        advice = ""  # the action contains it
+        advice = ""  # the action above is complete
     elif source.name == ALIGNED_VISION_TOPIC:
         reason = "The positions that EKF2 rotated into its own frame do not fit the IMU."
         action = "Align the positioning frame with north."

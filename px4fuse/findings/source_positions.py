@@ -134,8 +134,8 @@ def detect(analysis: Analysis) -> Findings:
     yield from detect_repeated_jumps(analysis)
     yield from detect_jumps(analysis)
     yield from detect_outliers(analysis)
-    # The errors of odometry (with orientation) are correlated because of drift. Positions
-    # reconstructed from EKF2 have neither their own timestamps nor variances
+    # Not for odometry (with orientation), whose errors are correlated because of drift, and not for
+    # positions that px4fuse reconstructs from EKF2's data
     if analysis.source.orientation is None and not analysis.source.origin.reconstructed:
         yield from detect_low_pass(analysis)
         yield from detect_scale_error(analysis)
