@@ -76,6 +76,8 @@ SMALL_INNOVATIONS_EXPLANATION = (
     "The innovations are smaller than expected. Small innovations are not a fault here: the "
     "source may drift, and innovations do not show drift. Do not reduce noise settings."
 )
+# Ratio actual ÷ reported σ: maximum against ground truth ÷ against the source, if both agree
+MAX_TRUTH_TO_SOURCE_RATIO = 2.0
 PRINTED_FIRST_BYTES = 4  # number of first bytes of an unreadable log that are printed
 ULOG_FIRST_BYTES = "55 4C 6F 67"  # first bytes of each ULog file (hexadecimal)
 HEADING_ERROR_EXPLANATION = (
@@ -389,11 +391,11 @@ def _format_lengths(length_by_filter_m: Mapping[FilterName, float]) -> str:
 
 
 def _format_actions(causes: Sequence[DiagnosedCause], notes: Sequence[Note]) -> tuple[str, ...]:
-    if not causes:
-        changes = [note.action for note in notes if note.action.startswith("Set ")]
-        optional_actions = [f"Optional: {lowercase_first_letter(change)}" for change in changes]
-        return tuple(dict.fromkeys(optional_actions))[:MAX_ACTIONS] or ("Change nothing.",)
-    numbered_sentences: list[str] = []
+    action_sentences = [
+        f"Optional: {lowercase_first_letter(note.action)}"
+        for note in notes
+        if not causes and note.action.startswith("Set ")
+    ]
     for number, cause in enumerate(causes, 1):
         alternative_texts = [
             _format_action(action) for group in cause.alternatives for action in group
@@ -405,22 +407,25 @@ def _format_actions(causes: Sequence[DiagnosedCause], notes: Sequence[Note]) -> 
             if action.commands or action.changes_something()
         ]
         label = f"Cause {number}, " if len(causes) > 1 else ""
-        numbered_sentences += [
+        action_sentences += [
             capitalise_first_letter(f"{label}{sentence}.") for sentence in sentences
         ]
-    return tuple(dict.fromkeys(numbered_sentences))[:MAX_ACTIONS]
+    if not (causes or action_sentences):
+        return ("Change nothing.",)
+    return tuple(dict.fromkeys(action_sentences))[:MAX_ACTIONS]
 
 
 def _format_action(action: Action) -> str:
     if action.where == "console":
-        # The sentence of this action is "PARAMETER OLD → NEW UNIT", and its command contains the
-        # parameter name
-        value_change_text = action.sentence.partition(" ")[2]
-        change_text = value_change_text if len(action.commands) == 1 else action.sentence
+        # Example: the command is "param set EKF2_EV_DELAY 100", the sentence "EKF2_EV_DELAY 0 → 100
+        # ms". A single command already shows the parameter: of the sentence, add only "0 → 100 ms"
+        change_text = action.sentence
+        if len(action.commands) == 1:
+            _, _, change_text = action.sentence.partition(" ")
         return f"EKF2: {', '.join(action.commands)} ({change_text})"
     if action.where == "shell":
-        # The command of this action is "px4fuse compare LOG --OPTION VALUE"
-        options_text = action.commands[0].partition(" --")[2]
+        # Of the command "px4fuse compare LOG --sigma-z 0.1", show only "--sigma-z 0.1"
+        _, _, options_text = action.commands[0].partition(" --")
         return f"KF: run again with --{options_text}"
     text = lowercase_first_letter(action.sentence.rstrip("."))
     return f"{action.target_name}: {text}"
@@ -471,21 +476,25 @@ def _explain_verdict_differences(
     """
     may_drift, ekf2_errors = analysis.source.origin.may_drift, analysis.main.filters["ekf2"].truth
     sigma_verdicts = _mark_explained_verdicts(sigma_verdicts, causes, may_drift=may_drift)
-    mean_position_nees_at_horizon = getattr(ekf2_errors, "nees_position_horizon_mean", None)
-    horizon_sigma_ratio = math.sqrt(mean_position_nees_at_horizon or math.inf)
     # make_sigma_verdicts returns the verdict on EKF2 against ground truth last
     *other_verdicts, ekf2_verdict = sigma_verdicts
+    # Without another cause, EKF2 is consistent if the error of its delayed position fits σ
     if (
         not causes
         and ekf2_verdict.word == "overconfident"
-        and classify_sigma_ratio(horizon_sigma_ratio, "truth") == "consistent"
+        and isinstance(ekf2_errors, ErrorsAgainstTruth)
+        and ekf2_errors.nees_position_horizon_mean
     ):
-        return (*other_verdicts, replace(ekf2_verdict, is_explained=True)), (
-            "EKF2 reports σ for its delayed position at the fusion horizon. The error of the "
-            f"delayed position is {format_ratio(horizon_sigma_ratio)} times σ, so EKF2 is "
-            "consistent. The output predictor adds a lag error to the published position."
-        )
+        horizon_sigma_ratio = math.sqrt(ekf2_errors.nees_position_horizon_mean)
+        if classify_sigma_ratio(horizon_sigma_ratio, "truth") == "consistent":
+            return (*other_verdicts, replace(ekf2_verdict, is_explained=True)), (
+                "EKF2 reports σ for its delayed position at the fusion horizon. The error of the "
+                f"delayed position is {format_ratio(horizon_sigma_ratio)} times σ, so EKF2 is "
+                "consistent. The output predictor adds a lag error to the published position."
+            )
     explanation = _explain_differing_verdicts(analysis, sigma_verdicts, causes)
+    # If verdicts of innovations and of ground truth contradict each other without a known reason,
+    # none of them is explained
     if explanation == UNEXPLAINED_DIFFERENCE_TEXT:
         sigma_verdicts = tuple(replace(verdict, is_explained=False) for verdict in sigma_verdicts)
     elif not explanation and may_drift and any(verdict.is_explained for verdict in sigma_verdicts):
@@ -496,23 +505,25 @@ def _explain_verdict_differences(
 def _explain_differing_verdicts(
     analysis: Analysis, sigma_verdicts: Sequence[Verdict], causes: Sequence[DiagnosedCause]
 ) -> str:
+    # Filters that a re-run without the first fault (of KF, or a replay of EKF2) improves
     filters_affected_by_fault = {
         "ekf2" if rerun.is_prediction else "kf"
         for rerun in (causes[0].reruns if causes else ())
         if rerun.improves == "position and σ"
     }
-    filters_with_differing_ratios = [
-        source.filter
-        # sigma_verdicts contains two verdicts of each filter: from innovations (source), then from
-        # errors against ground truth
-        for source, truth in zip(sigma_verdicts[::2], sigma_verdicts[1::2], strict=True)
-        if source.ratio is not None
-        and truth.ratio is not None
-        and (
-            source.word != truth.word
-            or (truth.ratio > 2.0 * source.ratio and source.filter not in filters_affected_by_fault)
+    filters_with_differing_ratios = []
+    for filter_name in FILTER_NAMES:
+        # A filter has two verdicts: first against the source, then against ground truth
+        source, truth = (verdict for verdict in sigma_verdicts if verdict.filter == filter_name)
+        if source.ratio is None or truth.ratio is None:
+            continue
+        # The first fault explains a larger ratio against ground truth with the same verdict
+        is_truth_ratio_unexplained = (
+            truth.ratio > MAX_TRUTH_TO_SOURCE_RATIO * source.ratio
+            and filter_name not in filters_affected_by_fault
         )
-    ]
+        if source.word != truth.word or is_truth_ratio_unexplained:
+            filters_with_differing_ratios.append(filter_name)
     if not filters_with_differing_ratios:
         return ""
     finding_ids = {finding.id for finding in analysis.findings}
@@ -537,10 +548,10 @@ def _explain_differing_verdicts(
             "errors."
         )
     explanation = UNEXPLAINED_DIFFERENCE_TEXT
-    if "ekf2_heading_error" in finding_ids:
-        explanation = HEADING_ERROR_EXPLANATION
     if "source_outliers" in finding_ids and "ekf2" in filters_with_differing_ratios:
         explanation = OUTLIER_EXPLANATION
+    elif "ekf2_heading_error" in finding_ids:
+        explanation = HEADING_ERROR_EXPLANATION
     return explanation
 
 
@@ -549,19 +560,22 @@ def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCau
         return ""
     difference_text = _format_difference(effect.axis, effect.difference_rms_m)
     reruns = ranked_causes[0].reruns
+    # A fault affects a filter if a re-run without the fault improves the position of the filter.
+    # If the log cannot show this effect, the filter counts as affected
     filters_affected_by_fault = {
         rerun.filter
         for rerun in reruns
-        if "position" in classify_improvement(rerun) or not can_show_effect(rerun)
+        if classify_improvement(rerun) in ("position", "position and σ")
+        or not can_show_effect(rerun)
     }
     if len(filters_affected_by_fault) == 2:
         return (
             f"{difference_text}. The main fault affects both KF and EKF2, so the difference "
             "KF − EKF2 hardly shows this fault."
         )
-    corrected_filter: FilterName = "kf"
-    if filters_affected_by_fault == {"ekf2"} or all(rerun.filter == "ekf2" for rerun in reruns):
-        corrected_filter = "ekf2"
+    # State the re-run of the affected filter or, if neither is affected, of any filter, KF first
+    possible_filters = filters_affected_by_fault or {rerun.filter for rerun in reruns}
+    corrected_filter: FilterName = "kf" if "kf" in possible_filters else "ekf2"
     for rerun in reruns:  # the best re-run first
         rms_m = rerun.after.difference_rms_m
         if rerun.filter == corrected_filter and rms_m is not None:
@@ -600,19 +614,19 @@ def _describe_kf_settings(
     """Return all settings of KF with their origin, and the options that change a default."""
     setting_texts, changed_options = [], []
     for name in KF_NUMERIC_SETTINGS:
-        value, default, chosen = (
+        used, default, requested = (
             getattr(settings, name) for settings in (analysis.settings, Settings(), request)
         )
+        origin_text = "default" if used == default else "set by the user"
         default_text = f"{default:g}"
-        value_origin = "default" if value == default else "set by the user"
-        # the default of SIGMA_Z for GNSS is EKF2's noise parameter
+        # For GNSS, the default of SIGMA_Z is not a number: it is EKF2's noise parameter
         if name == "sigma_z_m" and analysis.source.origin.is_gnss:
-            default_text = f"from {find_aid(analysis).noise}"
-            if chosen is None:
-                value_origin = default_text
-        setting_texts.append(f"{SETTING_RANGES[name].format_value(value)} ({value_origin})")
-        if chosen is not None and f"{chosen:g}" != default_text:
-            option = f"{COMPARISON_OPTIONS[name]} {chosen:g}"
+            default, default_text = None, f"from {find_aid(analysis).noise}"
+            if requested is None:
+                origin_text = default_text
+        setting_texts.append(f"{SETTING_RANGES[name].format_value(used)} ({origin_text})")
+        if requested not in (None, default):
+            option = f"{COMPARISON_OPTIONS[name]} {requested:g}"
             changed_options.append(f"{option} (default {default_text})")
     return ", ".join(setting_texts), tuple(changed_options)
 
@@ -621,11 +635,10 @@ def _format_changed_parameters(analysis: Analysis) -> tuple[str, ...]:
     aid = analysis.source.origin.aid
     if aid is None:
         return ()
-    log = analysis.flight.log
-    return tuple(
-        f"{name} {value:.4g} {MODEL_PARAMETERS[name].unit}".rstrip() + f" (PX4 default {default:g})"
-        for name in (aid.noise, aid.delay, aid.gate)
-        if name in MODEL_PARAMETERS
-        and (value := log.parameters.get(name)) is not None
-        and not math.isclose(value, default := log.find_default_value(name), rel_tol=1e-3)
-    )
+    log, parameter_texts = analysis.flight.log, []
+    for name in (aid.noise, aid.delay, aid.gate):
+        value, default = log.parameters.get(name), log.find_default_value(name)
+        if value is not None and not math.isclose(value, default, rel_tol=1e-3):
+            value_text = f"{name} {value:.4g} {MODEL_PARAMETERS[name].unit}".rstrip()
+            parameter_texts.append(f"{value_text} (PX4 default {default:g})")
+    return tuple(parameter_texts)

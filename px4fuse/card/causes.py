@@ -99,6 +99,7 @@ def rank_causes(analysis: Analysis, cause_findings: Sequence[Finding]) -> list[R
         is_repeated_verdict = FINDING_CATALOGUE[finding.id].verdict == "repeated"
         if is_repeated_verdict:
             reruns = tuple(filter(may_improve_filter, reruns))
+        # a fault is no cause if all re-runs could show an effect of it, but show none
         elif reruns and all(can_show_effect(rerun) and not has_effect(rerun) for rerun in reruns):
             continue
         log_sigma_ratio_reduction = sum(map(compute_sigma_ratio_improvement, reruns))
@@ -109,8 +110,9 @@ def rank_causes(analysis: Analysis, cause_findings: Sequence[Finding]) -> list[R
         causes or repeated_verdicts,
         key=lambda cause: (
             cause.rank,
-            # faults of the source first: a changed setting may only hide them
-            0 < cause.rank < 4 and _is_setting_fault(cause.finding),
+            # faults of the source first: a changed setting may only hide them. This order does not
+            # apply to warnings without a helpful re-run (rank 4)
+            cause.rank < 4 and _is_setting_fault(cause.finding),
             -cause.log_sigma_ratio_reduction,
         ),
     )
@@ -121,17 +123,24 @@ def _is_setting_fault(finding: Finding) -> bool:
     return bool(rerun_kinds) and rerun_kinds <= SETTING_CHANGE_KINDS
 
 
-def _find_cause_rank(finding: Finding, reruns: Iterable[Rerun]) -> int:
+def _find_cause_rank(finding: Finding, reruns: Sequence[Rerun]) -> int:
+    """Return the importance of a possible cause.
+
+    0 faults that make all results meaningless, 1 a re-run without the fault makes a filter
+    consistent, 2 a re-run halves the deviation of the reported σ, 3 other errors, 4 other warnings.
+    """
     if (
         FINDING_CATALOGUE[finding.id].verdict == "meaningless"
         or WRONG_CONVENTION_KEY in finding.evidence
     ):
         return 0
+    # A changed setting that leaves a filter overconfident is not the main cause, although its
+    # re-run may make another ratio consistent
     if _is_setting_fault(finding) and any(map(remains_overconfident, reruns)):
         return 3
-    if any(becomes_consistent(rerun) for rerun in reruns):
+    if any(map(becomes_consistent, reruns)):
         return 1
-    if any(halves_discrepancy(rerun) for rerun in reruns):
+    if any(map(halves_discrepancy, reruns)):
         return 2
     return 3 if finding.severity == "error" else 4
 
@@ -211,8 +220,9 @@ def _make_actions(
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
     """Return the actions against a cause: alternative groups of actions, and further actions.
 
-    The user chooses one of the groups and takes all its actions. All further actions are necessary,
-    too.
+    The user takes all actions of one group, and all further actions. If re-runs with corrected
+    timestamps and with another delay parameter both help, the groups are the correction of the
+    sender, and that of the delay parameter.
     """
     finding = ranked_cause.finding
     rerun_by_filter_and_kind = {(rerun.filter, rerun.kinds[0]): rerun for rerun in useful_reruns}
@@ -220,8 +230,9 @@ def _make_actions(
     offset_rerun = rerun_by_filter_and_kind.get(
         ("ekf2", "time offset")
     ) or rerun_by_filter_and_kind.get(("kf", "time offset"))
-    actions = _make_sender_actions(analysis, ranked_cause, offset_rerun, request)
+    sender_actions = _make_sender_actions(analysis, ranked_cause, offset_rerun, request)
     alternative_action_groups: tuple[tuple[Action, ...], ...] = ()
+    actions: list[Action] = []
     if delay_rerun:
         # The user corrects either the timestamps or the delay parameter: two alternatives. A
         # parameter that both corrections change (EKF2_DELAY_MAX) is not part of the alternatives,
@@ -234,12 +245,12 @@ def _make_actions(
         }
         delay_action = make_parameter_action(analysis, delay_parameter_values)
         if offset_rerun:
-            alternative_action_groups = tuple(actions), (delay_action,)
-            actions = []
+            alternative_action_groups = tuple(sender_actions), (delay_action,)
         else:
-            actions = [delay_action]
-    elif not offset_rerun and _is_setting_fault(finding) and ranked_cause.reruns:
-        actions = []  # only the settings are wrong
+            actions.append(delay_action)
+    # If only the settings are wrong, the sender needs no change
+    elif offset_rerun or not (_is_setting_fault(finding) and ranked_cause.reruns):
+        actions += sender_actions
     actions += _make_setting_actions(analysis, useful_reruns, request)
     # Actions on the vehicle first, actions on KF last
     actions.sort(key=lambda action: action.target == "KF")
@@ -255,12 +266,16 @@ def _make_setting_actions(
 ) -> Iterator[Action]:
     """Yield the changes of EKF2 parameters and KF options that the re-runs tested."""
     for rerun in reruns:
-        (kind,), change = rerun.kinds, dict(rerun.change)
+        change = dict(rerun.change)
+        if rerun.kinds == ("delay",):  # _make_actions makes this action
+            continue
         if rerun.filter == "ekf2":
+            # Without corrections of the data: the action for the sender states them
             change = {name: value for name, value in change.items() if name in MODEL_PARAMETERS}
-            if change and kind != "delay":
+            if change:
                 yield make_parameter_action(analysis, change)
-        elif kind != "defaults" and change.keys() <= COMPARISON_OPTIONS.keys():
+        # The closing sentence of the cause names the default settings
+        elif rerun.kinds != ("defaults",) and change.keys() <= COMPARISON_OPTIONS.keys():
             # --clock-offset replaces the offset from the alignment, so it must include that offset
             if TIME_OFFSET_KEY in change and (alignment := analysis.source.alignment):
                 total_s = change[TIME_OFFSET_KEY] + alignment.clock_offset_s
@@ -298,8 +313,8 @@ def _make_sender_actions(
     - Other faults: the action of the finding, if it has one.
     """
     finding, source, model = ranked_cause.finding, analysis.source, analysis.ekf2_model
-    # users cannot shift the timestamps of a GNSS receiver: for GNSS, the action is the remedy of
-    # the finding, if the finding has one
+    # A re-run with corrected timestamps helps: the sender must shift them. A GNSS receiver cannot
+    # shift its timestamps: it needs the remedy of the finding
     if offset_rerun and not (source.origin.is_gnss and finding.remedy):
         shift_s = offset_rerun.change[TIME_OFFSET_KEY]
         # a re-run of KF tests the total time offset. The sender corrects only the difference from
@@ -307,9 +322,9 @@ def _make_sender_actions(
         if offset_rerun.filter == "kf":
             shift_s -= analysis.settings.clock_offset_s
         return [Action("sender", lowercase_first_letter(format_sender_action(source, shift_s)))]
+    # No re-run tested the delay of GNSS (KF uses vision): set the delay that the finding states
     if (
         finding.id == "ekf2_gps_delay_wrong"
-        # without a re-run of EKF2 with another delay, use the delay that the finding estimates
         and not ranked_cause.reruns
         and not isinstance(model, Unavailable)
     ):
@@ -353,9 +368,12 @@ def _explain_missing_action(
 
 
 def _find_action_target(finding: Finding, source: PositionTrack | None = None) -> ActionTarget:
+    """Return the device or filter to which the remedy of a finding applies."""
     group = FINDING_CATALOGUE[finding.id].group
     target = ACTION_TARGET_BY_FINDING_ID.get(finding.id) or ACTION_TARGET_BY_GROUP[group]
+    # Findings on the source have a remedy for EKF2 if EKF2, not the source, is set wrongly
     is_remedy_about_ekf2_parameter = finding.remedy.startswith(("Set EKF2_", "Check EKF2_"))
+    # The same finding covers errors of KF and EKF2: its evidence names the filters
     is_ekf2_error_only = (
         finding.id == "error_exceeds_reported_sigma"
         and finding.evidence.get("filter") == "ekf2"

@@ -23,7 +23,6 @@ from .remedy import (
 )
 from .rerun_effects import (
     CHANGE_KEYS_WITHOUT_EFFECT_ALONE,
-    CONSISTENCY_STATISTICS,
     FORWARD_BIAS_KEY,
     OUTLIERS_KEY,
     RIGHT_BIAS_KEY,
@@ -80,6 +79,7 @@ def find_candidate_changes(
     is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
     axis_tuning = find_axis_tuning(estimates.tuning, axis)
     changes = list[ChangedValues]()
+    # 1. Noise settings and outliers
     # Do not reduce the noise settings for GNSS or odometry: innovations do not show the slow errors
     # of these sources, only ground truth does
     origin = comparison.source.origin
@@ -95,11 +95,12 @@ def find_candidate_changes(
             )
         if not is_underconfident and len(axis_tuning.outlier_time_s):
             changes.append({OUTLIERS_KEY: float(len(axis_tuning.outlier_time_s))})
-    # For EKF2, the delay parameter corrects the time offset, if PX4 permits the delay
-    delay_change = ekf2_inputs and make_estimated_delay_change(
-        comparison, ekf2_inputs, estimates.time_offset
-    )
+    # 2. Time offset. For EKF2, the delay parameter corrects it, if PX4 permits the delay
+    delay_change = {}
+    if ekf2_inputs is not None:
+        delay_change = make_estimated_delay_change(comparison, ekf2_inputs, estimates.time_offset)
     changes += [delay_change] if delay_change else _find_offset_changes(estimates, ekf2_inputs)
+    # 3. Horizontal axes only: rotation, then accelerometer bias (KF) or default parameters (EKF2)
     if axis == "down":
         return changes
     if (
@@ -115,41 +116,24 @@ def find_candidate_changes(
     return changes
 
 
-def find_main_axis_changes(
+def find_additional_changes(
     comparison: Comparison,
     estimates: Estimates,
     ekf2_inputs: ReplayInputs | None,
-    axis: str,
-    summary: FilterSummary,
+    changes: list[ChangedValues],
 ) -> list[ChangedValues]:
-    """Return the changes to test in re-runs of KF or EKF2 along the axis of largest motion.
-
-    A change consists of new values of KF settings or EKF2 parameters, or of corrected positions.
-    ``ekf2_inputs`` is None for KF. The report shows the effect of these changes also if the filter
-    is consistent.
-    """
-    # Changes that may correct the mean NIS are before those that may correct the mean NEES
-    changes = remove_repeated_changes(
-        change
-        for statistic in CONSISTENCY_STATISTICS[::-1]
-        for change in find_candidate_changes(
-            comparison, estimates, ekf2_inputs, axis, summary, statistic
-        )
-    )
+    """Return the changes to test in addition to ``changes`` along the axis of largest motion."""
     if ekf2_inputs is not None:
-        # The delay parameter has limits, so its effect can differ from that of corrected
-        # timestamps: test both
-        if any(ekf2_inputs.aid.delay in change for change in changes):
-            changes += _find_offset_changes(estimates, ekf2_inputs)
-        return remove_repeated_changes(changes)
+        # The user can correct a late EKF2 track by the delay parameter or, alternatively, by the
+        # timestamps. find_candidate_changes returns only one of these changes: test the other, too
+        is_delay_tested = any(ekf2_inputs.aid.delay in change for change in changes)
+        return _find_offset_changes(estimates, ekf2_inputs) if is_delay_tested else []
     # For KF, also test SIGMA_A and SIGMA_Z together, and their default values
     noise_changes = [change for change in changes if change.keys() <= KF_NOISE_SETTINGS]
-    if len(noise_changes) > 1:
-        changes.append({name: value for change in noise_changes for name, value in change.items()})
-    default_settings = find_default_settings(comparison)
-    if default_settings and noise_changes:
-        changes.append(default_settings)
-    return changes
+    if not noise_changes:
+        return []
+    both_noises = {name: value for change in noise_changes for name, value in change.items()}
+    return [change for change in (both_noises, find_default_settings(comparison)) if change]
 
 
 def remove_repeated_changes(changes: Iterable[ChangedValues]) -> list[ChangedValues]:
@@ -198,16 +182,15 @@ def _find_offset_changes(
 ) -> list[ChangedValues]:
     """Return the change that corrects a significant time offset of the source, if any."""
     time_offset = estimates.time_offset
-    if (
-        isinstance(time_offset, Unavailable)
-        or not time_offset.is_determinable
-        or not time_offset.is_significant(
-            time_offset.offset_s if ekf2_inputs else time_offset.remaining_s
-        )
-    ):
+    if isinstance(time_offset, Unavailable) or not time_offset.is_determinable:
+        return []
+    # The user's --clock-offset corrects the timestamps for KF, but not for EKF2
+    uncorrected_s = time_offset.remaining_s if ekf2_inputs is None else time_offset.offset_s
+    if not time_offset.is_significant(uncorrected_s):
         return []
     change = {TIME_OFFSET_KEY: round(time_offset.offset_s, 3)}
     if ekf2_inputs is not None:
+        # With earlier timestamps, positions are older: EKF2 needs a longer buffer to fuse them
         position_age_ms = ekf2_inputs.settings[ekf2_inputs.aid.delay] - 1e3 * time_offset.offset_s
         change |= make_delay_max_change(ekf2_inputs.settings, position_age_ms)
     return [change]
@@ -222,18 +205,15 @@ def _find_kf_noise_changes(
         (SIGMA_A_KEY, axis_tuning.sigma_a_two_state),
         (SIGMA_Z_KEY, axis_tuning.sigma_z),
     ):
-        setting = getattr(settings, name)
-        # A setting is too large if it is above the 95 % interval of its estimate, and too small if
-        # it is below. If only the upper limit of the interval is known, a setting that is too large
-        # is reduced to it
-        if is_underconfident:
-            estimate = noise.value_or_bound(0.0)
+        setting, estimate = getattr(settings, name), noise.value
+        if is_underconfident:  # is the setting too large, above the 95 % interval?
             is_significant = noise.high is not None and setting > noise.high
-        else:
-            estimate = noise.value or 0.0
+            if estimate is None:  # only the upper limit is known: reduce the setting to this limit
+                estimate = noise.high
+        else:  # is the setting too small, below the 95 % interval?
             is_significant = noise.low is not None and setting < noise.low
         if noise.value is None and name == SIGMA_Z_KEY:
-            estimate = max(estimate, MIN_RERUN_SIGMA_Z_M)
+            estimate = max(estimate or 0.0, MIN_RERUN_SIGMA_Z_M)
         if estimate and is_significant:
             changes.append({name: float(f"{estimate:.3g}")})
     return changes
@@ -263,15 +243,15 @@ def _find_ekf2_noise_changes(
 
 def _find_default_changes(log: LogInfo, ekf2_inputs: ReplayInputs) -> list[ChangedValues]:
     """Return one change to PX4's default for each EKF2 noise that differs from the default."""
-    gate, logged_parameters, changes = (
-        ekf2_inputs.aid.gate,
-        ekf2_inputs.settings,
-        list[ChangedValues](),
-    )
-    for name in (gate, *PARAMETERS_SET_TO_DEFAULT):
-        default, value = log.find_default_value(name), logged_parameters.get(name, np.nan)
+    gate_parameter = ekf2_inputs.aid.gate
+    changes = list[ChangedValues]()
+    for name in (gate_parameter, *PARAMETERS_SET_TO_DEFAULT):
+        default, value = log.find_default_value(name), ekf2_inputs.settings.get(name, np.nan)
+        # Only a gate that is too small affects a consistent filter: it rejects normal positions
+        if name == gate_parameter and value > default:
+            continue
         # A missing parameter is NaN. Comparisons with NaN are False, so it is not changed
-        if abs(value - default) > 1e-3 * abs(default) and (name != gate or value < default):
+        if abs(value - default) > 1e-3 * abs(default):
             changes.append({name: default})
     return changes
 

@@ -152,26 +152,27 @@ def _summarise_filter(
     tracks: FilterTracks, truth: ErrorsAgainstTruth | Unavailable
 ) -> FilterSummary | UntestedFilter:
     innovations, variance = tracks.innovations, tracks.variance
-    fields: dict[str, Any] = {
-        name: float(np.sqrt(values.median())) if len(values) else None
-        for name, values in (
-            ("sigma_p_median_m", _drop_missing_values(variance, "position_variance_m2")),
-            (
-                "sigma_v_median_m_s",
-                _drop_missing_values(variance, "velocity_variance_m2_s2"),
-            ),
-            ("sigma_p_before_update_m", _drop_missing_values(innovations, "prior_variance_m2")),
-            ("sigma_p_after_update_m", _drop_missing_values(innovations, "posterior_variance_m2")),
-        )
-    } | {"truth": truth}
+    # Fields that FilterSummary and UntestedFilter have in common
+    common_fields: dict[str, Any] = {"truth": truth}
+    for name, table, column in (
+        ("sigma_p_median_m", variance, "position_variance_m2"),
+        ("sigma_v_median_m_s", variance, "velocity_variance_m2_s2"),
+        ("sigma_p_before_update_m", innovations, "prior_variance_m2"),
+        ("sigma_p_after_update_m", innovations, "posterior_variance_m2"),
+    ):
+        variances = _drop_missing_values(table, column)
+        common_fields[name] = float(np.sqrt(variances.median())) if len(variances) else None
+    # Unavailable if innovations are not logged or are too few for the test
     summary: FilterSummary | Unavailable
     if isinstance(innovations, Unavailable):
         summary = innovations
     else:
         innovation_m, variance_m2 = innovations[INNOVATION_COLUMNS].to_numpy().T
-        summary = FilterSummary.from_innovations(innovation_m, variance_m2, tracks.gate, **fields)
+        summary = FilterSummary.from_innovations(
+            innovation_m, variance_m2, tracks.gate, **common_fields
+        )
     if isinstance(summary, Unavailable):
-        return UntestedFilter(**structs.asdict(summary), **fields)
+        return UntestedFilter(**structs.asdict(summary), **common_fields)
     return summary
 
 
@@ -342,4 +343,6 @@ def _assess_horizontal_innovations(
         return None
     # Use only times with innovations along both axes
     common_rows = pd.concat(tables, axis=1, join="inner").to_numpy()
-    return assess_horizontal_nis(*common_rows.T.reshape(2, 2, -1))
+    # The four columns are innovation and variance along north, then along east
+    north_m, north_variance_m2, east_m, east_variance_m2 = common_rows.T
+    return assess_horizontal_nis((north_m, north_variance_m2), (east_m, east_variance_m2))

@@ -231,37 +231,46 @@ def _describe_rejections(explanation: DifferenceExplanation) -> str:
 def _describe_property_differences(
     comparison: Comparison, model: Ekf2Model, time_offset: SourceTimeOffset | Unavailable
 ) -> dict[str, str]:
+    """Describe how each property of EKF2 that KF can take over differs from that of KF."""
     kf_settings, inputs, source = comparison.settings, model.inputs, comparison.source
     parameters, aid, ekf2_source = inputs.settings, inputs.aid, inputs.received_positions.source
-    prediction_text = (
-        f"KF predicts every {kf_settings.dt_s:g} s, starting at its first position; EKF2 predicts "
-        f"every {1e3 * inputs.mean_step_s:.0f} ms"
-    )
+    # The first replacement changes all inputs of KF: accelerations, positions and sample times.
+    # State the largest of these differences
     if kf_settings.input == "zero":
-        prediction_text = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
+        sample_time_text = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
     elif source.name != ekf2_source:
-        prediction_text = f"KF uses positions of {source.name}; EKF2 uses {ekf2_source}"
+        sample_time_text = f"KF uses positions of {source.name}; EKF2 uses {ekf2_source}"
+    else:
+        sample_time_text = (
+            f"KF predicts every {kf_settings.dt_s:g} s, starting at its first position; EKF2 "
+            f"predicts every {1e3 * inputs.mean_step_s:.0f} ms"
+        )
+    # Age of a position at its timestamp: a position with a late timestamp has a negative offset
     position_age_ms = 1e3 * (source.assumed_delay_s - kf_settings.clock_offset_s)
     delay_text = (
         f"EKF2 assumes that positions are {parameters[aid.delay]:g} ms old ({aid.delay}), KF "
         f"assumes {position_age_ms:.0f} ms"
     )
     if isinstance(time_offset, SourceTimeOffset) and time_offset.is_determinable:
+        low_offset_s, high_offset_s = time_offset.interval_s
+        # The largest offset is the smallest age
         estimated_age_ms, low_ms, high_ms = (
             1e3 * (source.assumed_delay_s - offset_s)
-            for offset_s in (time_offset.offset_s, *time_offset.interval_s[::-1])
+            for offset_s in (time_offset.offset_s, high_offset_s, low_offset_s)
         )
         delay_text += (
             f". The maximum-likelihood age is {estimated_age_ms:.0f} ms (95 % {low_ms:.0f} to "
             f"{high_ms:.0f} ms)"
         )
+    # White acceleration noise adds the variance (σ · step)² per step: the same variance per second
+    # needs σ in proportion to 1 / √step
     acc_noise = parameters["EKF2_ACC_NOISE"]
     acc_noise_as_sigma_a = acc_noise * np.sqrt(inputs.mean_step_s / kf_settings.dt_s)
     higher_weighted_input = (
         "IMU" if acc_noise_as_sigma_a < kf_settings.sigma_a_m_s2 else "positions"
     )
     return {
-        steps.SAMPLE_TIMES_REPLACEMENT_NAME: prediction_text,
+        steps.SAMPLE_TIMES_REPLACEMENT_NAME: sample_time_text,
         steps.TIMESTAMPS_REPLACEMENT_NAME: delay_text,
         steps.MEASUREMENT_NOISE_REPLACEMENT_NAME: (
             f"EKF2 uses a measurement noise of {find_used_noise_m(inputs):.2g} m "

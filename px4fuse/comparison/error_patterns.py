@@ -221,25 +221,18 @@ def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
     time_s, position_m = _select_distinct_positions(comparison)
     if len(time_s) < MIN_POSITIONS:
         return None
-    rows = np.arange(2, len(time_s) - 2)
-    neighbour_rows = rows[:, None] + NEIGHBOUR_ROW_OFFSETS
-    elapsed_s = time_s[neighbour_rows] - time_s[rows, None]
     interval_s = compute_median_interval_s(time_s)
-    has_close_neighbours = (
-        np.ptp(elapsed_s, axis=1) < MAX_NEIGHBOUR_TIME_SPAN_IN_MEDIAN_INTERVALS * interval_s
-    )
-    rows, neighbour_rows, elapsed_s = (
-        array[has_close_neighbours] for array in (rows, neighbour_rows, elapsed_s)
-    )
-    # Weights of Lagrange interpolation at elapsed time 0: Π t_j / (t_j - t_i) over all j ≠ i
-    numerators = np.repeat(elapsed_s[:, None], len(NEIGHBOUR_ROW_OFFSETS), axis=1)
-    denominators = numerators - elapsed_s[:, :, None]
-    is_same = np.eye(len(NEIGHBOUR_ROW_OFFSETS), dtype=bool)
-    numerators[:, is_same] = denominators[:, is_same] = 1.0
-    weights = np.prod(numerators / denominators, axis=2)
-    # σ of a residual (position minus weighted sum of its neighbours) ÷ σ of a position, if all
-    # positions have the same σ
-    residual_to_position_sigma_ratio = np.sqrt(1.0 + np.sum(weights**2, axis=1))
+    rows, weights = _compute_interpolation_weights(time_s, interval_s)
+    # σ of the residual (value - Σ weight · neighbour) ÷ σ of a value, for equal σ of all values
+    sigma_ratio = np.sqrt(1.0 + np.sum(weights**2, axis=1))
+    is_accurate = sigma_ratio < MAX_RESIDUAL_TO_POSITION_SIGMA_RATIO
+    rows, weights, sigma_ratio = rows[is_accurate], weights[is_accurate], sigma_ratio[is_accurate]
+
+    def compute_residual(values: Array) -> Array:
+        neighbours = values[rows[:, None] + NEIGHBOUR_ROW_OFFSETS]
+        residuals = values[rows] - np.einsum("nk,nk...->n...", weights, neighbours)
+        return np.asarray((residuals.T / sigma_ratio).T)
+
     # Timestamps minus times at equal intervals. The running median follows drift and gaps, but not
     # jitter
     timestamp_deviation_s = time_s - interval_s * np.arange(len(time_s))
@@ -249,37 +242,38 @@ def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
     timestamp_delay_s = timestamp_deviation_s - np.median(
         sliding_window_view(padded_deviation_s, TIMESTAMP_MEDIAN_FILTER_LENGTH), axis=1
     )
+    # Velocity: displacement over ± 0.3 s, at least ± 2 rows
     half_window_rows = max(2, round(VELOCITY_HALF_WINDOW_S / interval_s))
-    window_first_rows = np.clip(rows - half_window_rows, 0, None)
-    window_last_rows = np.clip(rows + half_window_rows, None, len(time_s) - 1)
-    displacement_m = position_m[window_last_rows] - position_m[window_first_rows]
-    velocity_m_s = displacement_m / (time_s[window_last_rows] - time_s[window_first_rows])[:, None]
-    has_small_interpolation_noise = (
-        residual_to_position_sigma_ratio < MAX_RESIDUAL_TO_POSITION_SIGMA_RATIO
-    )
-
-    def compute_residual(values: Array) -> Array:
-        interpolated_values = np.einsum("nk,nk...->n...", weights, values[neighbour_rows])
-        scaled_residuals = (values[rows] - interpolated_values).T / residual_to_position_sigma_ratio
-        return np.asarray(scaled_residuals.T[has_small_interpolation_noise])
-
+    first_rows = np.maximum(rows - half_window_rows, 0)
+    last_rows = np.minimum(rows + half_window_rows, len(time_s) - 1)
+    displacement_m = position_m[last_rows] - position_m[first_rows]
+    velocity_m_s = displacement_m / (time_s[last_rows] - time_s[first_rows])[:, None]
     ekf2 = comparison.flight.ekf2
     ekf2_speed_m_s = None
     if isinstance(ekf2, Ekf2):
-        speed_at_ekf2_times_m_s = np.linalg.norm(
-            ekf2.state[Columns.VELOCITY[:2]].to_numpy(), axis=1
-        )
-        ekf2_speed_m_s = np.interp(
-            time_s[rows[has_small_interpolation_noise]],
-            ekf2.state.index.to_numpy(),
-            speed_at_ekf2_times_m_s,
-        )
+        speed_m_s = np.linalg.norm(ekf2.state[Columns.VELOCITY[:2]].to_numpy(), axis=1)
+        ekf2_speed_m_s = np.interp(time_s[rows], ekf2.state.index.to_numpy(), speed_m_s)
     return LocalResiduals(
         compute_residual(position_m),
-        velocity_m_s[has_small_interpolation_noise],
+        velocity_m_s,
         compute_residual(timestamp_delay_s),
         ekf2_speed_m_s,
     )
+
+
+def _compute_interpolation_weights(time_s: Array, interval_s: float) -> tuple[Array, Array]:
+    """Return rows, and for each row the weights of its four neighbours in a cubic interpolation.
+
+    Rows near gaps are omitted. The weights w of neighbours at elapsed times t interpolate cubic
+    polynomials exactly: Σ w = 1, and Σ w tᵏ = 0 for k = 1, 2, 3.
+    """
+    rows = np.arange(2, len(time_s) - 2)
+    neighbour_rows = rows[:, None] + NEIGHBOUR_ROW_OFFSETS
+    elapsed_intervals = (time_s[neighbour_rows] - time_s[rows, None]) / interval_s
+    is_without_gap = np.ptp(elapsed_intervals, axis=1) < MAX_NEIGHBOUR_TIME_SPAN_IN_MEDIAN_INTERVALS
+    # powers[row, k, neighbour] = tᵏ, so powers @ w = (1, 0, 0, 0): w is column 0 of the inverse
+    powers = elapsed_intervals[is_without_gap, None] ** np.arange(4)[:, None]
+    return rows[is_without_gap], np.linalg.inv(powers)[:, :, 0]
 
 
 def find_timestamp_jitter(errors: LocalResiduals) -> float | None:
@@ -315,11 +309,14 @@ def find_speed_dependent_noise(errors: LocalResiduals) -> SpeedDependentNoise | 
     speed_m_s = errors.ekf2_speed_m_s
     if speed_m_s is None:
         return None
+    # 1. Noise and speed must be correlated in the whole flight and in most flight parts: noise that
+    # is larger in one fast part may be unrelated to speed
     norms_and_speeds = np.column_stack([np.linalg.norm(errors.residual_m, axis=1), speed_m_s])
-    # Also test each flight part: noise that is larger in one fast part may be unrelated to speed
     flight_parts = np.array_split(norms_and_speeds, FLIGHT_PART_COUNT)
+    # Constant values have no rank correlation
     if not np.all([np.ptp(part, axis=0) for part in flight_parts]):
         return None
+    # Correlations ÷ σ, which is 1 / √n for n independent values without relation
     flight_z_score, *part_z_scores = (
         rank_correlation(*part.T) * np.sqrt(len(part) / RESIDUAL_CORRELATION_LENGTH)
         for part in (norms_and_speeds, *flight_parts)
@@ -329,6 +326,8 @@ def find_speed_dependent_noise(errors: LocalResiduals) -> SpeedDependentNoise | 
         or np.median(part_z_scores) < MIN_NOISE_SPEED_CORRELATION_SIGMAS
     ):
         return None
+    # 2. The noise must be larger in fast than in slow flight, along and across the track. Jitter of
+    # the timestamps increases the noise only along the track
     max_slow_m_s, min_fast_m_s = np.quantile(speed_m_s, [SLOW_SPEED_QUANTILE, FAST_SPEED_QUANTILE])
     is_slow, is_fast = speed_m_s <= max_slow_m_s, speed_m_s >= min_fast_m_s
     source_speed_m_s = np.linalg.norm(errors.velocity_m_s, axis=1, keepdims=True)
@@ -344,6 +343,7 @@ def find_speed_dependent_noise(errors: LocalResiduals) -> SpeedDependentNoise | 
         for noise_m in (along_track_residual_m, cross_track_residual_m)
     ):
         return None
+    # 3. Speed and noise of fast flight must be large enough to matter
     speed_dependent_noise = SpeedDependentNoise(
         slow_m=_estimate_sigma(errors.residual_m[is_slow]),
         fast_m=_estimate_sigma(errors.residual_m[is_fast]),
@@ -360,7 +360,11 @@ def find_speed_dependent_noise(errors: LocalResiduals) -> SpeedDependentNoise | 
 def fit_errors_against_truth(
     comparison: Comparison, local_residuals: LocalResiduals
 ) -> ErrorFit | None:
-    """Fit constant offset, scale, rotation and time offset to the errors against ground truth."""
+    """Fit constant offset, scale, rotation and time offset to the errors against ground truth.
+
+    Model for small errors: error = offset + scale · path + rotation · (path rotated by 90°) -
+    velocity · time offset; path is the true position minus its mean.
+    """
     truth = comparison.flight.truth
     if isinstance(truth, Unavailable):
         return None
@@ -376,12 +380,13 @@ def fit_errors_against_truth(
     path_mean_square_m2 = float(np.mean(np.sum(path_m**2, axis=1)))
     if path_mean_square_m2 < MIN_RMS_DISTANCE_FROM_PATH_MEAN_M**2:
         return None
+    # Derivatives of the error with respect to the parameters: offset north and east, scale, ...
     offset_columns = [np.tile(axis, (len(time_s), 1)) for axis in np.eye(2)]
     columns = np.stack(
         [*offset_columns, path_m, _rotate_clockwise_90_deg(path_m), -velocity_m_s], axis=-1
     )
     error_m = position_m - true_m
-    parameters, residual_m = _fit_least_squares(columns, error_m)
+    (_, _, scale, _, _), residual_m = _fit_least_squares(columns, error_m)
     # The σ of the scale factor depends on the number of independent errors, not of all errors
     interval_s = compute_median_interval_s(time_s)
     independent_error_count = len(time_s) / max(
@@ -390,8 +395,8 @@ def fit_errors_against_truth(
     scale_error_sigma = np.sqrt(
         np.mean(residual_m**2) / (path_mean_square_m2 * independent_error_count)
     )
-    # For odometry, drift is removed from the errors by subtraction of their running mean. It also
-    # removes constant offsets, so the two offset columns are omitted
+    # The drift of odometry is no fault: fit errors and columns without their running mean, and use
+    # these residuals. Without running mean, the columns of the constant offsets are zero: omit them
     if comparison.source.origin.may_drift:
         from scipy.ndimage import uniform_filter1d  # noqa: PLC0415 - slow import
 
@@ -403,16 +408,15 @@ def fit_errors_against_truth(
         _, residual_m = _fit_least_squares(
             remove_running_mean(columns)[..., 2:], remove_running_mean(error_m)
         )
-    _, _, scale, _, _ = parameters.tolist()
     return ErrorFit(
         time_s,
         velocity_m_s,
         path_m,
         columns,
         residual_m,
-        _estimate_sigma(local_residuals.residual_m),
-        scale,
-        float(scale_error_sigma),
+        white_noise_sigma_m=_estimate_sigma(local_residuals.residual_m),
+        scale=float(scale),
+        scale_error_sigma=float(scale_error_sigma),
     )
 
 
@@ -429,41 +433,38 @@ def _fit_least_squares(columns: Array, values: Array) -> tuple[Array, Array]:
 
 
 def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
-    """Return a sinusoidal position error that explains most of the time-correlated errors.
-
-    Return None if there is none. The errors are against ground truth.
-    """
-    duration_s = fit.time_s[-1] - fit.time_s[0]
+    """Return a sinusoidal error that explains most of the slow errors, if any."""
+    elapsed_s = fit.time_s - fit.time_s[0]
+    # Tested frequencies: k · frequency_step_hz, from 5 periods per flight to 4 samples per period
     max_frequency_hz = min(MAX_FREQUENCY_HZ, 0.25 / compute_median_interval_s(fit.time_s))
-    frequency_step_hz = FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT / duration_s
-    # Frequency k of the spectrum is k · frequency_step_hz
-    rows = slice(
-        round(MIN_PERIOD_COUNT / FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT),
-        int(np.ceil(max_frequency_hz / frequency_step_hz)),
-    )
-    if rows.stop <= rows.start or fit.compute_slow_error_mean_square_m2() <= 0.0:
+    frequency_step_hz = FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT / elapsed_s[-1]
+    first_k = round(MIN_PERIOD_COUNT / FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT)
+    end_k = int(np.ceil(max_frequency_hz / frequency_step_hz))
+    slow_error_mean_square_m2 = fit.compute_slow_error_mean_square_m2()
+    if end_k <= first_k or slow_error_mean_square_m2 <= 0.0:
         return None
-    # Sum the errors in time bins of equal length, so that one FFT tests all frequencies
-    bin_count = 2 ** int(
-        np.ceil(np.log2(MIN_BINS_PER_PERIOD * max_frequency_hz / frequency_step_hz))
-    )
-    bin_indices = np.rint((fit.time_s - fit.time_s[0]) * frequency_step_hz * bin_count).astype(int)
+    # One FFT computes all frequencies: sum the errors in time bins of equal length. The bins cover
+    # the time 1 / frequency_step_hz, several flights long; bins after the flight remain zero
+    min_bin_count = MIN_BINS_PER_PERIOD * max_frequency_hz / frequency_step_hz
+    bin_count = 2 ** int(np.ceil(np.log2(min_bin_count)))
+    bin_indices = np.rint(elapsed_s * frequency_step_hz * bin_count).astype(int)
     spectrum = np.fft.rfft(
         [np.bincount(bin_indices, error, bin_count) for error in fit.residual_m.T]
     )
-    powers = np.sum(np.abs(spectrum[:, rows]) ** 2, axis=0)
-    frequency_hz = float(frequency_step_hz * (rows.start + np.argmax(powers)))
+    powers = np.sum(np.abs(spectrum[:, first_k:end_k]) ** 2, axis=0)
+    frequency_hz = float(frequency_step_hz * (first_k + np.argmax(powers)))
 
-    def compute_mean_square_m2(values: Array, frequency_hz: float) -> float:
+    def compute_mean_square_m2(values: Array) -> float:
+        # Mean square of a sinusoid ½ a², with amplitude a = 2 |mean of the values · exp(-iωt)|
         complex_sinusoid = np.exp(-2j * np.pi * frequency_hz * fit.time_s)
         return 2.0 * float(np.sum(np.abs(complex_sinusoid @ values / len(values)) ** 2))
 
-    periodic_mean_square_m2 = compute_mean_square_m2(fit.residual_m, frequency_hz)
-    fraction_of_motion_at_error_frequency = compute_mean_square_m2(
-        fit.path_m, frequency_hz
-    ) / np.mean(np.sum(fit.path_m**2, axis=1))
+    periodic_mean_square_m2 = compute_mean_square_m2(fit.residual_m)
+    fraction_of_motion_at_error_frequency = compute_mean_square_m2(fit.path_m) / np.mean(
+        np.sum(fit.path_m**2, axis=1)
+    )
     amplitude_m = float(np.sqrt(2.0 * periodic_mean_square_m2))
-    explained_fraction = periodic_mean_square_m2 / fit.compute_slow_error_mean_square_m2()
+    explained_fraction = periodic_mean_square_m2 / slow_error_mean_square_m2
     if (
         explained_fraction < MIN_PERIODIC_ERROR_FRACTION
         or amplitude_m < MIN_AMPLITUDE_TO_WHITE_NOISE_RATIO * fit.white_noise_sigma_m
@@ -487,14 +488,16 @@ def find_time_offset_variation(fit: ErrorFit) -> TimeOffsetVariation | None:
     moving_part_indices = np.flatnonzero(mean_square_speeds > MIN_SPEED_FOR_OFFSET_M_S**2)
     if len(moving_part_indices) < 2:
         return None
-    # Fit one time offset per flight part together with offset, scale factor and rotation, which are
-    # constant in flight. To solve this fit in two steps, first remove the best time offsets of the
-    # flight parts from the errors and from the Jacobian columns, then fit the constant parameters
+    # Fit one time offset τ per flight part together with parameters p that are constant in flight:
+    # error = columns · p - velocity · τ[part]. Solve this fit in two steps (variable projection):
+    # first subtract from the errors, and from each column, the best time offsets of the flight
+    # parts. Then fit the constant parameters to the remainders
     error_per_time_offset_m_s = -fit.velocity_m_s
     inverse_square_speed_sums = np.zeros_like(square_speed_sums)
     inverse_square_speed_sums[moving_part_indices] = 1.0 / square_speed_sums[moving_part_indices]
 
     def fit_time_offsets_by_part(values: Array) -> Array:
+        # Least squares for one parameter in each flight part: Σ derivative · value / Σ derivative²
         velocity_weighted_sums = np.zeros((len(inverse_square_speed_sums), values.shape[-1]))
         np.add.at(
             velocity_weighted_sums,
@@ -511,39 +514,38 @@ def find_time_offset_variation(fit: ErrorFit) -> TimeOffsetVariation | None:
         error_per_time_offset_m_s[:, :, None] * time_offsets_by_column_s[flight_part_indices, None]
     )
     parameters, residual_m = _fit_least_squares(columns[..., :-1], columns[..., -1])
-    # Time offset of each flight part, without the effect of offset, scale factor and rotation
+    # Time offsets of (errors - columns · p), that is, of what the constant parameters do not
+    # explain
     offsets_s = (time_offsets_by_column_s @ np.append(-parameters, 1.0))[moving_part_indices]
-    slow_error_mean_square_m2 = fit.compute_slow_error_mean_square_m2()
-    unexplained_mean_square_m2 = (
-        float(np.mean(residual_m**2, axis=0).sum()) - 2.0 * fit.white_noise_sigma_m**2
-    )
+    white_noise_mean_square_m2 = 2.0 * fit.white_noise_sigma_m**2  # of two axes
+    slow_error_m2 = fit.compute_slow_error_mean_square_m2()
+    unexplained_m2 = float(np.mean(residual_m**2, axis=0).sum()) - white_noise_mean_square_m2
     if (
         np.ptp(offsets_s) < MIN_OFFSET_RANGE_S
-        or slow_error_mean_square_m2
-        < MIN_SLOW_TO_WHITE_NOISE_RATIO * 2.0 * fit.white_noise_sigma_m**2
-        or unexplained_mean_square_m2
-        > MAX_REMAINING_SLOW_ERROR_FRACTION * slow_error_mean_square_m2
+        or slow_error_m2 < MIN_SLOW_TO_WHITE_NOISE_RATIO * white_noise_mean_square_m2
+        or unexplained_m2 > MAX_REMAINING_SLOW_ERROR_FRACTION * slow_error_m2
     ):
         return None
     times_s = fit.time_s[0] + FLIGHT_PART_DURATION_FOR_OFFSET_S * (moving_part_indices + 0.5)
-    extreme_indices = [int(np.argmin(offsets_s)), int(np.argmax(offsets_s))]
-    return TimeOffsetVariation(
-        *offsets_s[extreme_indices].tolist(), *times_s[extreme_indices].tolist()
-    )
+    least, most = np.argmin(offsets_s), np.argmax(offsets_s)
+    return TimeOffsetVariation(*offsets_s[[least, most]].tolist(), *times_s[[least, most]].tolist())
 
 
 def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | None:
-    """Return the delay (s) of the logged attitude relative to the gyroscopes, if any."""
+    """Return the delay (s) of the logged attitude relative to the gyroscopes, if any.
+
+    Rotations over 0.1 s, sampled every 0.01 s, are compared: those between two attitudes, and those
+    from the integrated angular rates. The delay with the smallest mean square difference is chosen.
+    """
     imu_time_s, attitude_time_s = imu.index.to_numpy(), attitude.index.to_numpy()
     start_s = max(imu_time_s[0], attitude_time_s[0])
     end_s = min(imu_time_s[-1], attitude_time_s[-1])
     time_s = np.arange(
         start_s + MAX_ATTITUDE_DELAY_S, end_s - MAX_ATTITUDE_DELAY_S, ROTATION_INTERVAL_S
-    )
-    time_s = time_s[:MAX_ROTATION_COUNT]
-    samples_per_rotation = round(ROTATION_COMPARISON_TIME_S / ROTATION_INTERVAL_S)
+    )[:MAX_ROTATION_COUNT]
     if len(time_s) < MIN_POSITIONS:
         return None
+    samples_per_rotation = round(ROTATION_COMPARISON_TIME_S / ROTATION_INTERVAL_S)
     imu = rows_between(
         imu, time_s[0] - 2.0 * MAX_ATTITUDE_DELAY_S, time_s[-1] + 2.0 * MAX_ATTITUDE_DELAY_S
     )
@@ -578,13 +580,15 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
         )
         return float(np.mean(limited_angles_rad**2))
 
-    # Test every sixth delay, then every second delay near the best of them
-    tested_delays_in_rows = range(-max_delay_in_rows, max_delay_in_rows + 1, 2)
-    coarse_index = 3 * int(np.argmin([*map(compute_mean_square_rad2, tested_delays_in_rows[::3])]))
-    nearby_delays_in_rows = tested_delays_in_rows[max(coarse_index - 2, 0) : coarse_index + 3]
-    delay_in_rows = min(nearby_delays_in_rows, key=compute_mean_square_rad2)
+    # Test delays in steps of 6 rows, then in steps of 2 rows near the best of them
+    coarse_delays = range(-max_delay_in_rows, max_delay_in_rows + 1, 6)
+    coarse_delay = min(coarse_delays, key=compute_mean_square_rad2)
+    fine_delays = range(
+        max(coarse_delay - 4, -max_delay_in_rows), min(coarse_delay + 4, max_delay_in_rows) + 1, 2
+    )
+    delay_in_rows = min(fine_delays, key=compute_mean_square_rad2)
     delay_s = ROTATION_INTERVAL_S * delay_in_rows
-    is_delay_significant = abs(delay_s) >= MIN_ATTITUDE_DELAY_S and compute_mean_square_rad2(
-        delay_in_rows
-    ) < MAX_ROTATION_DIFFERENCE_RATIO_WITHOUT_DELAY * compute_mean_square_rad2(0)
-    return delay_s if is_delay_significant else None
+    if abs(delay_s) < MIN_ATTITUDE_DELAY_S:
+        return None
+    max_rad2 = MAX_ROTATION_DIFFERENCE_RATIO_WITHOUT_DELAY * compute_mean_square_rad2(0)
+    return delay_s if compute_mean_square_rad2(delay_in_rows) < max_rad2 else None

@@ -158,9 +158,10 @@ def estimate_noises(
     motion_cache : dict, optional
         Cache of the motion from the IMU.
     """
-    flight, low_imu_rate_reason = comparison.flight, explain_low_imu_rate(comparison.flight)
+    flight = comparison.flight
     if flight.log.is_assessed:
         return {HORIZONTAL: DIAGNOSIS_WITHHELD}
+    low_imu_rate_reason = explain_low_imu_rate(flight)
     return tune(
         comparison.input_axes,
         comparison.settings,
@@ -246,12 +247,14 @@ def _fit_source_errors(
 ]:
     """Fit biases, scale factor and jumps, then the time correlation of the remaining errors.
 
-    Each fit uses the results of the fit before.
+    Each fit uses the results of the fit before. The second and third returned values are two
+    alternative models of the time correlation: low-pass filter, and time-correlated noise.
     """
     axes_and_tuning = _select_horizontal_axes(comparison, tuning)
     if isinstance(axes_and_tuning, Unavailable):
         return axes_and_tuning, axes_and_tuning, axes_and_tuning
     flight, settings, (axes, axis_tuning) = comparison.flight, comparison.settings, axes_and_tuning
+    # All fits use timestamps with the significant part of the estimated time offset
     offset_s = 0.0
     if (
         isinstance(time_offset, SourceTimeOffset)
@@ -259,6 +262,7 @@ def _fit_source_errors(
         and abs(time_offset.remaining_s) > time_offset.significance_limit_s
     ):
         offset_s = time_offset.remaining_s
+    # 1. Biases, scale factor and jumps
     systematic_errors = fit_systematic_errors(
         flight,
         axes,
@@ -270,7 +274,8 @@ def _fit_source_errors(
         source_reset_times_s=comparison.source.reset_times_s.tolist(),
     )
     jumps = systematic_errors.jumps if isinstance(systematic_errors, SystematicErrors) else ()
-    # The exact time of a jump is unknown: exclude the measurements directly after it
+    # 2. Time correlation of the errors, without outliers. The exact time of a jump is unknown:
+    # exclude the measurements directly after it, too
     time_s, excluded_times_s = axes[0].measurement_time_s, axis_tuning.outlier_time_s
     for jump in jumps:
         is_after_jump = (time_s >= jump.time_s) & (
@@ -289,7 +294,7 @@ def _fit_source_errors(
     )
     if isinstance(time_correlation_fit, Unavailable):
         return systematic_errors, time_correlation_fit, time_correlation_fit
-    # With ground truth, time-correlated noise is fitted to the errors of the positions
+    # 3. With ground truth on all axes, fit time-correlated noise to the errors of the positions
     source_low_pass, correlated_noise = time_correlation_fit
     truths = [comparison.axes[axis.name].truth for axis in axes]
     available_truths = [truth for truth in truths if not isinstance(truth, Unavailable)]
@@ -303,7 +308,8 @@ def _fit_source_errors(
             correlated_noise,
             source_low_pass,
         )
-    # A low-pass filter with a short lag keeps the oscillation in the positions
+    # 4. Withdraw a low-pass filter that an oscillation of the IMU imitates. A real filter would
+    # pass the oscillation to the positions if its lag is short: 2π · frequency · lag < 1
     if oscillation is not None and (
         2.0 * np.pi * oscillation.frequency_hz * source_low_pass.lag_s < 1.0
     ):
@@ -360,12 +366,18 @@ def widen_for_scatter(time_offset: SourceTimeOffset, cause: str) -> SourceTimeOf
     """
     offsets_s = np.array([part.offset_s for part in time_offset.parts])
     weights = np.array([part.sigma_s**-2.0 for part in time_offset.parts])
-    # With too few flight parts, the scatter of their time offsets is unknown. A drift or change of
-    # the time offset cannot be distinguished from scatter
+    # The clock drift cannot be distinguished from scatter: withdraw it. Test a change against the
+    # scatter instead of σ
+    time_offset = structs.replace(
+        time_offset,
+        drift_ppm=None,
+        drift_sigma_ppm=None,
+        change_p_value=_compute_change_p_value(offsets_s, weights),
+    )
+    # Too few parts to estimate the scatter
     if len(offsets_s) <= MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE:
-        return structs.replace(
-            time_offset, change_p_value=None, drift_ppm=None, drift_sigma_ppm=None
-        )
+        return time_offset
+    # Mean square of the deviations from the weighted mean ÷ σ² (chi-square ÷ degrees of freedom)
     variance_factor = _compute_weighted_square_sum(offsets_s, weights) / (len(offsets_s) - 1)
     widening_factor = max(1.0, variance_factor) ** 0.5
     low_s, high_s = (
@@ -384,9 +396,6 @@ def widen_for_scatter(time_offset: SourceTimeOffset, cause: str) -> SourceTimeOf
         sigma_s=time_offset.sigma_s * widening_factor,
         is_determinable=not reason,
         reason=reason,
-        drift_ppm=None,
-        drift_sigma_ppm=None,
-        change_p_value=_compute_change_p_value(offsets_s, weights),
     )
 
 

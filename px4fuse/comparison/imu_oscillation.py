@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from px4fuse.core.arrays import compute_median_interval_s, integrate_cumulatively
+from px4fuse.core.arrays import Array, compute_median_interval_s, integrate_cumulatively
 from px4fuse.filter.frame_rotation import heading_rad
 from px4fuse.flight.model import Columns, Unavailable
 
@@ -46,6 +46,61 @@ def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | Non
     Second differences of the positions are compared with those of the doubly integrated
     acceleration, in axes that turn with the heading. Complex numbers are north + i east.
     """
+    signals = _compute_second_differences(comparison)
+    if signals is None:
+        return None
+    second_differences_m, interval_s = signals
+    # 1. Power spectra of source, IMU, and their difference (the error)
+    sample_count = second_differences_m.shape[1]
+    window = np.hanning(sample_count)
+    source_m, imu_m = second_differences_m * window
+    spectra = np.fft.fft([source_m, imu_m, imu_m - source_m])
+    # The signals are complex: an oscillation along one axis has equal powers at positive and at
+    # negative frequency. Add both. Column -n is the negative frequency of column n
+    count = sample_count // 2
+    powers = np.abs(spectra[:, 1:count]) ** 2 + np.abs(spectra[:, :-count:-1]) ** 2
+    # The Hann window spreads an oscillation over 3 frequencies: add their powers
+    source_power, imu_power, error_power = (np.convolve(row, np.ones(3), "same") for row in powers)
+    frequencies_hz = np.arange(1, count) / (sample_count * interval_s)
+    # 2. The peak of the error with the largest ratio to the median power at similar frequencies
+    peaks = 1 + np.flatnonzero(
+        (error_power[1:-1] > error_power[:-2]) & (error_power[1:-1] > error_power[2:])
+    )
+    max_frequency_hz = min(MAX_OSCILLATION_FREQUENCY_HZ, MAX_FREQUENCY_TO_RATE_RATIO / interval_s)
+    is_tested = (frequencies_hz >= MIN_OSCILLATION_FREQUENCY_HZ) & (
+        frequencies_hz < max_frequency_hz
+    )
+    ratio_by_peak: dict[int, float] = {}
+    for peak in peaks[is_tested[peaks]].tolist():
+        low, high = np.searchsorted(
+            frequencies_hz,
+            [frequencies_hz[peak] / BAND_LIMIT_RATIO, frequencies_hz[peak] * BAND_LIMIT_RATIO],
+        )
+        ratio_by_peak[peak] = float(error_power[peak] / np.median(error_power[low : high + 1]))
+    if not ratio_by_peak:
+        return None
+    peak, peak_to_median_ratio = max(ratio_by_peak.items(), key=lambda item: item[1])
+    frequency_hz = float(frequencies_hz[peak])
+    # 3. Amplitude of the acceleration. The 3 frequencies together have 1.5 times the power of the
+    # middle one. With both signs of the frequency, imu_power is 3 times the power of the middle one
+    amplitude_m = 2.0 * np.sqrt(imu_power[peak] / 3.0) / window.sum()
+    # Derivative ÷ difference of a sinusoid of this frequency; its square is the ratio for second
+    # differences
+    acceleration_per_difference = np.pi * frequency_hz / np.sin(np.pi * frequency_hz * interval_s)
+    oscillation = ImuOscillation(frequency_hz, float(amplitude_m * acceleration_per_difference**2))
+    is_oscillating = (
+        peak_to_median_ratio > MIN_PEAK_TO_MEDIAN_POWER_RATIO
+        and source_power[peak] < MAX_SOURCE_TO_IMU_POWER_RATIO * imu_power[peak]
+        and oscillation.amplitude_m_s2 > MIN_AMPLITUDE_M_S2
+    )
+    return oscillation if is_oscillating else None
+
+
+def _compute_second_differences(comparison: PreparedComparison) -> tuple[Array, float] | None:
+    """Return second differences (m) of source and IMU positions in two rows, and interval (s).
+
+    The axes turn with the heading: real part forward, imaginary part right.
+    """
     acceleration, attitude = comparison.input_axes[0].acceleration, comparison.flight.attitude
     samples = comparison.source_samples[Columns.POSITION[:2]].dropna()
     if isinstance(acceleration, Unavailable) or isinstance(attitude, Unavailable):
@@ -61,60 +116,12 @@ def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | Non
         return None
     velocity_m_s = acceleration.acceleration_integral_m_s[:2].T
     imu_position_m = integrate_cumulatively(velocity_m_s, imu_time_s)
-    positions_m = np.stack(
-        [
-            np.interp(time_s, source_time_s, samples.to_numpy() @ [1.0, 1j]),
-            np.interp(time_s, imu_time_s, imu_position_m @ [1.0, 1j]),
-        ]
-    )
+    positions_m = [
+        np.interp(time_s, source_time_s, samples.to_numpy() @ [1.0, 1j]),
+        np.interp(time_s, imu_time_s, imu_position_m @ [1.0, 1j]),
+    ]
     headings_rad = np.unwrap(heading_rad(attitude))
     rotation_to_vehicle_axes = np.exp(
         -1j * np.interp(time_s[1:-1], attitude.index.to_numpy(), headings_rad)
     )
-    # Second differences are proportional to the acceleration (factor: interval²)
-    window = np.hanning(len(rotation_to_vehicle_axes))
-    second_differences_m = np.diff(positions_m, 2, axis=1) * rotation_to_vehicle_axes * window
-    spectra = np.fft.fft([*second_differences_m, np.diff(second_differences_m, axis=0)[0]])
-    count = len(rotation_to_vehicle_axes) // 2
-    # The signals are complex, so an oscillation along one axis has equal powers at positive and
-    # negative frequency: add both. Rows of the spectra: source, IMU, and their difference. Column
-    # -n is the negative frequency of column n
-    powers = np.abs(spectra[:, 1:count]) ** 2 + np.abs(spectra[:, :-count:-1]) ** 2
-    source_power, imu_power, error_power = (np.convolve(row, np.ones(3), "same") for row in powers)
-    frequencies_hz = np.arange(1, count) / (len(rotation_to_vehicle_axes) * interval_s)
-    first, end = np.searchsorted(
-        frequencies_hz,
-        [
-            MIN_OSCILLATION_FREQUENCY_HZ,
-            min(MAX_OSCILLATION_FREQUENCY_HZ, MAX_FREQUENCY_TO_RATE_RATIO / interval_s),
-        ],
-    )
-    peaks = 1 + np.flatnonzero(
-        (error_power[1:-1] > error_power[:-2]) & (error_power[1:-1] > error_power[2:])
-    )
-    peaks = peaks[(peaks >= first) & (peaks < end)]
-    # Rows from frequency ÷ ratio to frequency · ratio, for each peak
-    band_rows = np.searchsorted(
-        frequencies_hz,
-        np.outer([1.0 / BAND_LIMIT_RATIO, BAND_LIMIT_RATIO], frequencies_hz[peaks]),
-    ).T
-    medians = [np.median(error_power[low : high + 1]) for low, high in band_rows]
-    if not medians:
-        return None
-    peak_index = int(np.argmax(error_power[peaks] / medians))
-    peak = peaks[peak_index]
-    frequency_hz = float(frequencies_hz[peak])
-    # The Hann window spreads an oscillation over 3 bins with a total power of 1.5 times that of the
-    # middle bin. imu_power adds positive and negative frequency: 3 times the power of the middle
-    # bin
-    amplitude_m = 2.0 * np.sqrt(imu_power[peak] / 3.0) / window.sum()
-    # Amplitude of the derivative of a sinusoid ÷ amplitude of its difference over interval_s. The
-    # square is the same ratio for second derivative and second difference
-    acceleration_per_difference = np.pi * frequency_hz / np.sin(np.pi * frequency_hz * interval_s)
-    oscillation = ImuOscillation(frequency_hz, float(amplitude_m * acceleration_per_difference**2))
-    is_oscillating = (
-        error_power[peak] > MIN_PEAK_TO_MEDIAN_POWER_RATIO * medians[peak_index]
-        and source_power[peak] < MAX_SOURCE_TO_IMU_POWER_RATIO * imu_power[peak]
-        and oscillation.amplitude_m_s2 > MIN_AMPLITUDE_M_S2
-    )
-    return oscillation if is_oscillating else None
+    return np.diff(positions_m, 2, axis=1) * rotation_to_vehicle_axes, interval_s

@@ -77,6 +77,9 @@ def _find_heading_of_largest_noise(north_and_east: Sequence[AxisComparison]) -> 
     correlation = np.sin(0.5 * np.pi * np.sign(innovation_changes_m).prod(axis=1).mean())
     if abs(correlation) * np.sqrt(len(innovation_changes_m)) < MIN_CORRELATION_SIGMAS:
         return None
+    # Direction of largest variance (principal axis) of a covariance matrix with σ of north and
+    # east: tan(2 · heading) = 2 · correlation · σ_north · σ_east / (σ_north² - σ_east²). The median
+    # of the absolute values is proportional to σ, and insensitive to outliers
     north_m, east_m = np.median(np.abs(innovation_changes_m), axis=0)
     double_angle_rad = np.arctan2(2.0 * correlation * north_m * east_m, north_m**2 - east_m**2)
     return float(np.degrees(0.5 * double_angle_rad)) % 180.0
@@ -99,6 +102,7 @@ def find_noisy_flight_part(
     if sigma_a is None or sigma_z is None:
         return None
     axis_motions = [preintegrate(axis, settings) for axis in axes]
+    # Times of the positions that have an innovation
     time_s = axes[0].measurement_time_s[-len(axis_motions[0].measurement_m) :]
     if len(time_s) < MAX_FLIGHT_PART_COUNT * MIN_PART_MEASUREMENTS // 2:
         return None
@@ -106,11 +110,11 @@ def find_noisy_flight_part(
     part_edges = np.linspace(0, len(time_s), part_count + 1).astype(int)
 
     def compute_scaled_innovations(is_excluded: BoolArray | None) -> Array:
+        # |innovation| / √S of each axis ÷ its median: without the effect of a wrong noise setting
         axis_innovations = [
             innovations(axis_motion, sigma_a, sigma_z, is_excluded) for axis_motion in axis_motions
         ]
         magnitudes = np.abs([nu / np.sqrt(s) for nu, s in axis_innovations])
-        # Division by the median removes the effect of a wrong noise setting
         return magnitudes / np.median(magnitudes, axis=1, keepdims=True)
 
     scaled_innovations = compute_scaled_innovations(None)
@@ -120,8 +124,10 @@ def find_noisy_flight_part(
     # A flight part is noisy if its median innovation is above the geometric mean of the smallest
     # and the largest median of all parts: this limit separates two levels of noise
     noisy_parts = np.flatnonzero(part_medians > np.sqrt(part_medians.min() * part_medians.max()))
-    # The noisy parts must be one continuous time span, but not the whole flight
-    if len(noisy_parts) in (0, part_count) or np.ptp(noisy_parts) >= len(noisy_parts):
+    if len(noisy_parts) in (0, part_count):
+        return None
+    # The noisy parts must be consecutive, so that they are one time span
+    if noisy_parts[-1] - noisy_parts[0] + 1 > len(noisy_parts):
         return None
     first_row, end_row = part_edges[noisy_parts[0]], part_edges[noisy_parts[-1] + 1]
     is_noisy = np.zeros(len(time_s), bool)

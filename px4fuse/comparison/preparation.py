@@ -75,6 +75,7 @@ def prepare_comparison_inputs(
     SettingsError
         A setting is out of range, the segment is empty, or required acceleration is missing.
     """
+    # 1. Position source, with corrected timestamps, axes and unit
     for name in ("start_s", "end_s", "clock_offset_s"):
         value = getattr(request, name)
         if isinstance(value, float) and not math.isfinite(value):
@@ -87,12 +88,13 @@ def prepare_comparison_inputs(
     flight, source, settings, convention = _correct_convention(
         flight, source, settings, is_checked=not (keep_positions_as_sent or flight.log.is_assessed)
     )
-    # The order is important: lever arm and EKF2's origin are subtracted from positions in NED with
-    # correct timestamps. make_axes needs the final heights
+    # 2. Positions in EKF2's frame. The order is important: lever arm and origin need positions in
+    # NED with correct timestamps, and the axes need the final heights
     source = _subtract_lever_arm(source, flight)
     source = _shift_vision_to_ekf2_origin(source, flight)
     source = _use_barometer_height(source, flight, request.height)
     flight = select_source_innovations(flight, source)
+    # 3. Segment and axes
     segment = choose_segment(flight, source, request.start_s, request.end_s)
     # GNSS heights are noisy, so they are analysed only on request
     is_gnss = source.origin.is_fused_as_gnss
@@ -101,8 +103,9 @@ def prepare_comparison_inputs(
     axes = make_axes(flight, source, segment, names=axis_names, heading_deg=request.heading_deg)
     if isinstance(flight.truth, Truth) and flight.truth.name == source.name:
         flight = replace(flight, truth=NO_SEPARATE_TRUTH)
+    # 4. Default settings of KF that depend on the log: SIGMA_Z for GNSS is √R of EKF2's fusion, and
+    # without IMU data the acceleration is zero
     if is_gnss and request.sigma_z_m is None:
-        # SIGMA_Z is √R of EKF2's GNSS fusion
         default_noise_m = MODEL_PARAMETERS[GNSS_POS.noise].default
         sigma_z_m = (
             find_observation_variance(flight, source, axes[0], segment, default_noise_m) ** 0.5
@@ -145,9 +148,12 @@ def _correct_convention(
     faults = find_convention_faults(convention, flight, source.frame)
     if convention is None or not faults:
         return flight, source, settings, convention
-    offset_range, clock_offset_s = SETTING_RANGES["clock_offset_s"], settings.clock_offset_s
-    clock_offset_s = min(max(clock_offset_s - faults.late_s, offset_range.low), offset_range.high)
-    settings = replace(settings, clock_offset_s=clock_offset_s)
+    # convert_to_px4_convention adds -late_s to the timestamps: report this as clock offset of KF
+    offset_range = SETTING_RANGES["clock_offset_s"]
+    clock_offset_s = np.clip(
+        settings.clock_offset_s - faults.late_s, offset_range.low, offset_range.high
+    )
+    settings = replace(settings, clock_offset_s=float(clock_offset_s))
     return *convert_to_px4_convention(flight, source, convention, faults), settings, convention
 
 
@@ -158,7 +164,6 @@ def select_source_innovations(flight: Flight, track: PositionTrack) -> Flight:
     """
     if isinstance(flight.ekf2, Unavailable) or not track.origin.is_fused_as_gnss:
         return flight
-    streams = dict(flight.streams)
     ekf2 = replace_vision_by_gnss_innovations(
         flight.ekf2, GNSS if track.barometer is None else GNSS_WITH_BAROMETER_HEIGHT
     )
@@ -174,6 +179,8 @@ def select_source_innovations(flight: Flight, track: PositionTrack) -> Flight:
         for item in flight.missing
         if not item.source and item not in missing_vision_innovations
     ]
+    streams = dict(flight.streams)
+    # List the topics of the GNSS innovations as a stream with the properties of EKF2's state
     if "ekf2_state" in streams and ekf2.aids:
         streams["ekf2_innovations"] = replace(streams["ekf2_state"], topics=ekf2.innovation_topics)
     missing_data = (*other_missing_data, *missing_gnss_innovations)
@@ -264,14 +271,18 @@ def _use_barometer_height(
         raise MissingDataError(
             f"{log_name}: the log contains no barometer height.", GNSS["vertical"].logging_remedy
         )
-    uses_barometer = height_sensor == "barometer" or (
-        height_sensor is None
-        and track.origin.is_fused_as_gnss
+    # Without a request, use the height sensor that EKF2 used
+    has_ekf2_only_barometer = (
+        track.origin.is_fused_as_gnss
         and has_fused_aid(ekf2, BAROMETER.name)
         and not has_fused_aid(ekf2, GNSS["vertical"].aid)
     )
+    uses_barometer = height_sensor == "barometer" or (
+        height_sensor is None and has_ekf2_only_barometer
+    )
     if not uses_barometer or barometer_heights is None:
         return track
+    # The reference of barometer heights is arbitrary: shift them to EKF2's height, if possible
     offset_m = barometer_heights["down_m"].iloc[0]
     height_note = "heights are barometer heights relative to the first barometer sample"
     if isinstance(ekf2, Ekf2):
@@ -280,7 +291,9 @@ def _use_barometer_height(
         )
         if np.isfinite(ekf2_down_m).any():
             offset_m = float(np.nanmedian(barometer_heights["down_m"] - ekf2_down_m))
-        height_note = "heights are barometer heights minus their median difference to EKF2's height"
+            height_note = (
+                "heights are barometer heights minus their median difference to EKF2's height"
+            )
     return replace(
         track,
         barometer=barometer_heights - offset_m,
@@ -291,6 +304,7 @@ def _use_barometer_height(
 
 def explain_missing_source(flight: Flight) -> Unavailable:
     """Return the reason why the log has no position source, and the action for the user."""
+    # 1. Possible sources, and general action, for a ULog or for MAVLink telemetry
     topics = f"{', '.join(SOURCE_TRACK_NAMES)}, and EKF2 innovations of external vision"
     remedy = (
         "set SDLOG_PROFILE to 129 and send the UWB position to PX4 as VISION_POSITION_ESTIMATE, or "
@@ -302,6 +316,7 @@ def explain_missing_source(flight: Flight) -> Unavailable:
         remedy = (
             f"give the position file of the positioning system as argument `position`{or_ulog}."
         )
+    # 2. Sources in the log that are not used by default: EKF2 did not fuse them
     if flight.positions:
         track = flight.positions[0]
         remedy = (
@@ -370,9 +385,10 @@ def choose_segment(
         chosen_start_s = chosen_start_s if start_s is None else start_s
         chosen_end_s = chosen_end_s if end_s is None else end_s
         reason = f"chosen with {' and '.join(given_options)}"
+        # A time outside the log has no positions: the error below then states the chosen times
         clipped_span_s = max(chosen_start_s, 0.0), min(chosen_end_s, log.duration_s)
-        is_outside_log = clipped_span_s[0] >= clipped_span_s[1]
-        if (chosen_start_s, chosen_end_s) != clipped_span_s and not is_outside_log:
+        is_inside_log = clipped_span_s[0] < clipped_span_s[1]
+        if is_inside_log and clipped_span_s != (chosen_start_s, chosen_end_s):
             chosen_start_s, chosen_end_s = clipped_span_s
             reason += "; the log covers only part of the chosen time"
     segment = Segment(

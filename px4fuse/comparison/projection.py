@@ -56,6 +56,7 @@ def remove_origin_resets(
         reset for reset in ekf2.resets if segment.start_s < reset.time_s <= segment.end_s
     ]
     state = ekf2.state.copy() if resets_in_segment else ekf2.state
+    # Number of resets of each quantity that are removed or kept, for example "2 of height"
     removed_texts, kept_texts = list[str](), list[str]()
     for label, quantity, columns in (
         ("horizontal position", "position", Columns.POSITION[:2]),
@@ -71,26 +72,27 @@ def remove_origin_resets(
         ]
         if not resets:
             continue
-        texts = kept_texts
+        has_only_moved_origin = False
         if quantity == "position":  # a velocity does not depend on the origin
+            # Without resets of the origin, the track is nearer to the measured positions
             samples = cut_to_segment(track.samples, segment)[columns].dropna()
             compute_squared_distance_m2 = partial(_compute_squared_distance_m2, samples)
             candidates = _make_states_without_resets(ekf2.state[columns], resets, axes)
             closest_state = min(candidates, key=compute_squared_distance_m2)
-            if compute_squared_distance_m2(
+            has_only_moved_origin = compute_squared_distance_m2(
                 closest_state
-            ) < MAX_SQUARED_DISTANCE_RATIO_WITHOUT_RESETS * compute_squared_distance_m2(ekf2.state):
-                state[columns], texts = closest_state, removed_texts
+            ) < MAX_SQUARED_DISTANCE_RATIO_WITHOUT_RESETS * compute_squared_distance_m2(ekf2.state)
+            if has_only_moved_origin:
+                state[columns] = closest_state
+        texts = removed_texts if has_only_moved_origin else kept_texts
         texts.append(f"{len(resets)} of {label}")
+    treatments = {
+        "removed from EKF2's track: the resets only move the origin of EKF2's frame": removed_texts,
+        "kept: the resets correct an error of EKF2": kept_texts,
+    }
     statements = (
         f"Jumps by EKF2 resets ({', '.join(texts)}) are {treatment}"
-        for texts, treatment in (
-            (
-                removed_texts,
-                "removed from EKF2's track: the resets only move the origin of EKF2's frame",
-            ),
-            (kept_texts, "kept in EKF2's track: the resets correct an error of EKF2"),
-        )
+        for treatment, texts in treatments.items()
         if texts
     )
     return state, ". ".join(statements)
@@ -106,13 +108,12 @@ def _make_states_without_resets(
     """
     reset_m = np.array([reset.delta for reset in resets])[:, axes]
     is_after_reset = np.array([published_state.index >= reset.time_s for reset in resets]).T
-    for earlier_count in range(len(resets) + 1):
-        # Express all positions in the frame between two resets: add each earlier reset to the
-        # positions before it, and subtract each later reset from the positions after it
-        frame_shift_m = (~is_after_reset[:, :earlier_count]) @ reset_m[
-            :earlier_count
-        ] - is_after_reset[:, earlier_count:] @ reset_m[earlier_count:]
-        yield published_state + frame_shift_m
+    # Without its previous resets, each position refers to the origin of the first interval
+    state_without_resets = published_state - is_after_reset @ reset_m
+    yield state_without_resets
+    # The sum of the first resets converts all positions to the origin of a later interval
+    for origin_shift_m in np.cumsum(reset_m, axis=0):
+        yield state_without_resets + origin_shift_m
 
 
 def _compute_squared_distance_m2(samples: pd.DataFrame, state: pd.DataFrame) -> float:
@@ -187,12 +188,14 @@ def project_fusion_horizon_position(
 def _find_altitude_offset_m(ekf2: Ekf2, down_m: pd.Series) -> float:
     """Return the altitude (m) of EKF2's origin if logged heights are altitudes, else 0.
 
-    Since PX4 v1.16, EKF2 fuses altitudes above sea level as soon as it has an origin.
+    ``down_m`` are the logged heights: down from the origin, or negative altitudes. Since PX4
+    v1.16, EKF2 fuses altitudes above sea level as soon as it has an origin.
     """
     published_down_m = np.interp(down_m.index, ekf2.state.index, ekf2.state["down_m"])
     altitude_m = 0.0 if isinstance(ekf2.record, Unavailable) else ekf2.record.altitude_m
-    distance_m = float((down_m - published_down_m).median())
-    return altitude_m if abs(distance_m + altitude_m) < abs(distance_m) else 0.0
+    # About 0 for heights from the origin, about -altitude_m for altitudes
+    difference_m = float((down_m - published_down_m).median())
+    return altitude_m if abs(difference_m + altitude_m) < abs(difference_m) else 0.0
 
 
 def project_innovations(

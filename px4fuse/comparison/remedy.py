@@ -51,18 +51,18 @@ def estimate_gnss_delay_ms(
     - GNSS has no velocity, or
     - EKF2 ignores EKF2_GPS_DELAY, because the GNSS driver reports measurement times.
     """
+    # received_positions are those of GNSS if EKF2 fused both
     received_positions, vision = model.inputs.received_positions, model.inputs.vision_positions
     if (
         vision is None
         or comparison.source.name != vision.source
         or comparison.convention_faults
-        or estimate_delay_if_not_as_logged_ms(
-            comparison, time_offset, model.inputs.settings[EV_POS.delay]
-        )
-        is not None
         or received_positions.velocity_m_s is None
         or received_positions.uses_sender_timestamps
     ):
+        return None
+    vision_delay_ms = model.inputs.settings[EV_POS.delay]
+    if estimate_delay_if_not_as_logged_ms(comparison, time_offset, vision_delay_ms) is not None:
         return None
     nis_sums = []
     for replay in replay_with_settings(
@@ -77,10 +77,11 @@ def estimate_gnss_delay_ms(
             for axis in ("north", "east")
             for updates in update_tables
         ]
-        # NIS sum over position and velocity along both axes. To compare replays, the mean NIS is
-        # multiplied by the same number of samples in all replays
+        # The number of updates depends on the delay. To compare the replays, scale the mean NIS to
+        # the number of received positions (each with the NIS of 2 axes · position and velocity)
         nis_sums.append(float(np.mean(nis)) * len(nis) * len(received_positions.timestamp_s))
-    # NIS sum = -2 ln p = (delay - estimate)² / σ² + constant
+    # Normal distribution: NIS sum = -2 ln p = (delay - estimate)² / σ² + constant. Fit this
+    # parabola
     quadratic_coefficient, linear_coefficient, _ = np.polyfit(GNSS_DELAYS_MS, nis_sums, 2)
     if quadratic_coefficient <= 0.0:
         return None
@@ -105,27 +106,25 @@ def estimate_ekf2_parameters(
     Noises of GNSS and odometry are not reduced: innovations do not show their slow errors.
     """
     changes: dict[str, float] = {}
-    inputs, origin, min_vision_noise_m = model.inputs, comparison.source.origin, 0.0
+    inputs, origin, gnss_noise_m = model.inputs, comparison.source.origin, 0.0
     vision = inputs.vision_positions
+    # If EKF2 fused GNSS and vision, and KF uses vision: compare KF with EKF2's inputs from vision
     if vision is not None and comparison.source.name == vision.source:
         if (gnss_delay := estimate_gnss_delay_ms(comparison, model, time_offset)) is not None:
             changes |= make_delay_change(inputs, gnss_delay[0])
-        # While EKF2 fuses GNSS, it increases the noise of vision at least to that of GNSS
-        min_vision_noise_m = inputs.settings[GNSS_POS.noise]
+        gnss_noise_m = inputs.settings[GNSS_POS.noise]
         inputs = replace(inputs, aid=EV_POS, received_positions=vision)
     if not is_source_fused(comparison, inputs):
         return {}
     axis_tuning = find_first_available_tuning(tuning, HORIZONTAL, AISLE_AXIS, "north", "east")
-    # If EKF2 also fuses GNSS, a change of the vision noise has no effect if old and new value are
-    # below the GNSS noise
-    used_noise_m = find_used_noise_m(inputs)
-    min_noise_m = used_noise_m if origin.may_drift or origin.is_gnss else 0.0
-    if (
-        axis_tuning
-        and (noise_m := axis_tuning.sigma_z.value or 0.0) > min_noise_m
-        and max(noise_m, used_noise_m) > min_vision_noise_m
-    ):
-        changes |= make_estimated_noise_change(inputs, axis_tuning.sigma_z, noise_m)
+    if axis_tuning and (noise_m := axis_tuning.sigma_z.value):
+        used_noise_m = find_used_noise_m(inputs)
+        is_increase_only = origin.may_drift or origin.is_gnss
+        # While EKF2 fuses GNSS, it increases the noise of vision at least to that of GNSS: a change
+        # of a smaller noise to another smaller noise has no effect
+        has_effect = max(noise_m, used_noise_m) > gnss_noise_m
+        if has_effect and (noise_m > used_noise_m or not is_increase_only):
+            changes |= make_estimated_noise_change(inputs, axis_tuning.sigma_z, noise_m)
     return changes | make_estimated_delay_change(comparison, inputs, time_offset)
 
 
@@ -157,12 +156,12 @@ def estimate_delay_if_not_as_logged_ms(
         return None
     offset_s, applied_s = time_offset.offset_s, time_offset.applied_s
     low_s, high_s = time_offset.interval_s
-    if (
-        applied_s
-        and low_s <= applied_s <= high_s
-        and not comparison.convention_faults.late_s  # px4fuse detected and applied this offset
-    ):
+    # If late_s is not 0, px4fuse applied the offset, not the user
+    is_offset_from_user = applied_s and not comparison.convention_faults.late_s
+    if is_offset_from_user and low_s <= applied_s <= high_s:
         offset_s = applied_s
+    # assumed_delay_s was already subtracted from the timestamps of GNSS. The offset of late
+    # timestamps is negative, and adds to this delay
     estimated_delay_ms = 1e3 * (comparison.source.assumed_delay_s - offset_s)
     is_significant = time_offset.is_significant(1e-3 * (logged_delay_ms - estimated_delay_ms))
     return estimated_delay_ms if is_significant else None
@@ -188,11 +187,10 @@ def find_logged_delay_ms(comparison: PreparedComparison) -> float | None:
     if source.origin.aid is None or source.alignment is not None:
         return None
     logged_delay_ms = comparison.flight.log.parameters.get(source.origin.aid.delay)
-    return (
-        None
-        if source.origin.is_fused_as_gnss and source.assumed_delay_s == 0.0 != logged_delay_ms
-        else logged_delay_ms
-    )
+    # PX4 does not apply the delay to GNSS timestamps of the sender (assumed_delay_s is then 0)
+    if source.origin.is_fused_as_gnss and source.assumed_delay_s == 0.0:
+        return 0.0 if logged_delay_ms == 0.0 else None
+    return logged_delay_ms
 
 
 def find_delay_max_change(

@@ -167,15 +167,17 @@ def find_cause_rerun(
 
     def rank(rerun: Rerun) -> tuple[bool, int, bool, float]:
         explained_fraction_error = _compute_explained_fraction_error(rerun, statistic)
-        is_complete = (
+        is_sufficient = brings_inside_limits(rerun, statistic) or (
             rerun.corrects_sensor
             and explained_fraction_error <= ONLY_CAUSE_EXPLAINED_FRACTION_TOLERANCE
         )
-        # The re-run with the smallest tuple is the best. Order of importance: inconsistency
-        # corrected completely, few changes, sensor fault corrected, small remaining inconsistency
+        # A parameter without effect alone, for example EKF2_DELAY_MAX, does not count as a change
+        change_count = len(rerun.change.keys() - CHANGE_KEYS_WITHOUT_EFFECT_ALONE)
+        # min() prefers False to True: first sufficient re-runs, then few changes, then corrected
+        # sensor faults, then the smallest remaining inconsistency
         return (
-            not (is_complete or brings_inside_limits(rerun, statistic)),
-            len(rerun.change.keys() - CHANGE_KEYS_WITHOUT_EFFECT_ALONE),
+            not is_sufficient,
+            change_count,
             not rerun.corrects_sensor,
             explained_fraction_error,
         )
@@ -344,7 +346,8 @@ def can_show_improvement(rerun: Rerun) -> bool:
 def classify_improvement(rerun: Rerun) -> Improvement:
     """Return the quantities that a re-run improves: position, σ, both or nothing.
 
-    The position improves if its RMSE decreases by at least 20 %.
+    The position improves if its RMSE decreases by at least 20 %. σ improves if its ratio (actual ÷
+    reported σ) against source or truth becomes consistent or half as wrong, and no ratio worsens.
     """
     rmse_before_m, rmse_after_m = rerun.before.position_rmse_m, rerun.after.position_rmse_m
     is_position_better = bool(
@@ -352,10 +355,14 @@ def classify_improvement(rerun: Rerun) -> Improvement:
         and rmse_after_m is not None
         and rmse_after_m <= (1.0 - MIN_RMSE_REDUCTION) * rmse_before_m
     )
-    is_sigma_better = (becomes_consistent(rerun) or halves_discrepancy(rerun)) and all(
-        abs(math.log(ratio_after)) <= abs(math.log(ratio_before))
-        or classify_sigma_ratio(ratio_after, reference) == "consistent"
+    # A ratio worsens if it is farther from 1 and not consistent
+    has_worse_ratio = any(
+        abs(math.log(ratio_after)) > abs(math.log(ratio_before))
+        and classify_sigma_ratio(ratio_after, reference) != "consistent"
         for reference, ratio_before, ratio_after in compare_sigma_ratios(rerun)
+    )
+    is_sigma_better = not has_worse_ratio and (
+        becomes_consistent(rerun) or halves_discrepancy(rerun)
     )
     if is_position_better:
         return "position and σ" if is_sigma_better else "position"

@@ -5,8 +5,7 @@ If no single change is sufficient, the best change is combined with each other c
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import chain
+from functools import cache, partial
 from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
@@ -34,9 +33,9 @@ from px4fuse.flight.model import Columns, Spans, Unavailable
 
 from .changes import (
     classify_change,
+    find_additional_changes,
     find_axis_tuning,
     find_candidate_changes,
-    find_main_axis_changes,
     remove_repeated_changes,
 )
 from .comparison import (
@@ -52,7 +51,6 @@ from .model import (
     Comparison,
     ErrorsAgainstTruth,
     FilterDifference,
-    FilterName,
     FilterSummary,
     PreparedComparison,
     UntestedFilter,
@@ -97,12 +95,16 @@ def find_error_above_sigma(summary: FilterSummary | UntestedFilter) -> ErrorAbov
     if isinstance(truth, Unavailable):
         return None
     nis_mean = None if isinstance(summary, Unavailable) else summary.nis_mean
-    nees, rmse_m = truth.nees_position_mean or 0.0, truth.position_rmse_m
-    # The NEES at the fusion horizon contains no errors due to the lag of the output predictor
-    fusion_horizon_nees = truth.nees_position_horizon_mean or nees
-    if min(nees, fusion_horizon_nees) < MIN_REPORTED_NEES or (nis_mean or 0.0) >= MAX_NORMAL_NIS:
+    if nis_mean is not None and nis_mean >= MAX_NORMAL_NIS:
         return None
-    reported_sigma_m = summary.sigma_p_median_m or rmse_m / float(np.sqrt(nees))
+    # An error due only to the lag of the output predictor does not count. The NEES at the fusion
+    # horizon, if logged, does not contain this lag
+    nees, rmse_m = truth.nees_position_mean or 0.0, truth.position_rmse_m
+    fusion_horizon_nees = truth.nees_position_horizon_mean or nees
+    if min(nees, fusion_horizon_nees) < MIN_REPORTED_NEES:
+        return None
+    # Without a median of the reported σ: NEES = (error / σ)²
+    reported_sigma_m = summary.sigma_p_median_m or rmse_m / nees**0.5
     return ErrorAboveSigma(nees, rmse_m, reported_sigma_m, nis_mean)
 
 
@@ -125,16 +127,6 @@ class Reruns:
     reruns: tuple[Rerun, ...]
 
 
-class _Filter(NamedTuple):
-    """KF or EKF2, and a function that re-runs the filter with a change."""
-
-    name: FilterName
-    rerun: Callable[[AxisComparison, ChangedValues], RunStatistics]
-    # For EKF2 only: inputs of the replay, and evaluated time spans (s)
-    ekf2_inputs: ReplayInputs | None = None
-    evaluated_spans_s: Spans | None = None
-
-
 def rerun_filters(
     comparison: Comparison, estimates: Estimates, model: Ekf2Model | Unavailable
 ) -> tuple[Rerun, ...]:
@@ -143,28 +135,29 @@ def rerun_filters(
     EKF2 is re-run only if its replay agrees with the log, and only once for each change, because a
     replay contains all axes.
     """
-    filters = [_Filter("kf", partial(_rerun_kf, comparison, estimates.tuning))]
+    rerun_kf = partial(_rerun_kf, comparison, estimates.tuning)
+    reruns = [
+        rerun
+        for axis_result in comparison.axes.values()
+        for rerun in _rerun_with_changes(comparison, estimates, axis_result, rerun_kf)
+    ]
     if (
         isinstance(model, Ekf2Model)
         and model.agreement.good
         and is_source_fused(comparison, model.inputs)
     ):
-        replays: dict[frozenset[tuple[str, float]], Ekf2Replay] = {}
+
+        @cache  # one replay of each change for all axes; only hashable arguments can be cached
+        def replay_ekf2(change_items: frozenset[tuple[str, float]]) -> Ekf2Replay:
+            return _replay_ekf2(comparison, estimates.tuning, model, dict(change_items))
 
         def rerun_ekf2(axis_result: AxisComparison, change: ChangedValues) -> RunStatistics:
-            change_key = frozenset(change.items())
-            if change_key not in replays:
-                replays[change_key] = _replay_ekf2(comparison, estimates.tuning, model, change)
-            return _summarise_replay(comparison, model, replays[change_key], axis_result, change)
+            ekf2_replay = replay_ekf2(frozenset(change.items()))
+            return _summarise_replay(comparison, model, ekf2_replay, axis_result, change)
 
-        evaluated_spans_s = model.baseline_replay.find_evaluated_spans()
-        filters.append(_Filter("ekf2", rerun_ekf2, model.inputs, evaluated_spans_s))
-    return tuple(
-        rerun
-        for tested_filter in filters
-        for axis_result in comparison.axes.values()
-        for rerun in _rerun_with_changes(comparison, estimates, tested_filter, axis_result)
-    )
+        for axis_result in comparison.axes.values():
+            reruns += _rerun_with_changes(comparison, estimates, axis_result, rerun_ekf2, model)
+    return tuple(reruns)
 
 
 def rerun_kf_with_time_offset(prepared: PreparedComparison, time_offset: SourceTimeOffset) -> Rerun:
@@ -215,43 +208,55 @@ def _find_changes_to_test(
     summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
     if not isinstance(summary, FilterSummary) or (ekf2_inputs is not None and axis == "down"):
         return []  # EKF2's replay contains no vertical position
-    statistics: list[Statistic] = ["nees"] if find_error_above_sigma(summary) else []
-    if is_inconsistent(summary):
-        statistics.append("nis")
     candidates = {
         statistic: find_candidate_changes(
             comparison, estimates, ekf2_inputs, axis, summary, statistic
         )
-        for statistic in statistics
+        for statistic in CONSISTENCY_STATISTICS
     }
-    if axis_result is not comparison.main:
-        changes = remove_repeated_changes(chain.from_iterable(candidates.values()))
+    # Statistics that are wrong
+    statistics: list[Statistic] = ["nees"] if find_error_above_sigma(summary) else []
+    if is_inconsistent(summary):
+        statistics.append("nis")
+    if axis_result is comparison.main:
+        # Changes are also tested if no statistic is wrong. Those for the mean NIS are first
+        changes = [*candidates["nis"], *candidates["nees"]]
+        changes += find_additional_changes(comparison, estimates, ekf2_inputs, changes)
     else:
-        changes = find_main_axis_changes(comparison, estimates, ekf2_inputs, axis, summary)
+        changes = [change for statistic in statistics for change in candidates[statistic]]
     return [
         (change, tuple(statistic for statistic in statistics if change in candidates[statistic]))
-        for change in changes
+        for change in remove_repeated_changes(changes)
     ]
 
 
 def _rerun_with_changes(
     comparison: Comparison,
     estimates: Estimates,
-    tested_filter: _Filter,
     axis_result: AxisComparison,
+    rerun_filter: Callable[[AxisComparison, ChangedValues], RunStatistics],
+    model: Ekf2Model | None = None,
 ) -> list[Rerun]:
-    changes = _find_changes_to_test(comparison, estimates, tested_filter.ekf2_inputs, axis_result)
+    """Re-run a filter along an axis with each change to test; ``model`` is None for KF."""
+    ekf2_inputs = None if model is None else model.inputs
+    changes = _find_changes_to_test(comparison, estimates, ekf2_inputs, axis_result)
     if not changes:
         return []
-    original_statistics, is_logged = _find_statistics_of_unchanged_run(tested_filter, axis_result)
-    spans_s = tested_filter.evaluated_spans_s
+    # The re-runs are compared with the original run of KF. Those of EKF2 are compared with the log
+    # or, if the unchanged replay differs too much from the log, with the unchanged replay
+    original_statistics, is_logged, spans_s = rerun_filter(axis_result, {}), True, None
+    if model is not None:
+        spans_s = model.baseline_replay.find_evaluated_spans()
+        logged_statistics = _find_logged_statistics(original_statistics, axis_result, spans_s)
+        is_logged = logged_statistics is not None
+        original_statistics = logged_statistics or original_statistics
 
     def make_rerun(change: ChangedValues, discrepancies: Iterable[Statistic]) -> Rerun:
-        changed_statistics = tested_filter.rerun(axis_result, change)
+        changed_statistics = rerun_filter(axis_result, change)
         return Rerun(
-            filter=tested_filter.name,
+            filter="kf" if model is None else "ekf2",
             axis=axis_result.axis.name,
-            kinds=classify_change(comparison, tested_filter.ekf2_inputs, change),
+            kinds=classify_change(comparison, ekf2_inputs, change),
             change=change,
             discrepancies=tuple(
                 statistic
@@ -276,21 +281,13 @@ def _rerun_with_changes(
     return reruns
 
 
-def _find_statistics_of_unchanged_run(
-    tested_filter: _Filter, axis_result: AxisComparison
-) -> tuple[RunStatistics, bool]:
-    """Return the statistics with which the re-runs of a filter are compared.
-
-    KF: statistics of the original run. EKF2: statistics of the log or, if the unchanged replay
-    differs too much from the log, of the unchanged replay. The second value is False only for
-    statistics of a replay.
-    """
-    replayed, ekf2 = tested_filter.rerun(axis_result, {}), axis_result.ekf2_tracks
-    evaluated_spans_s, innovations = tested_filter.evaluated_spans_s, ekf2.innovations
-    if evaluated_spans_s is None:  # KF
-        return replayed, True
+def _find_logged_statistics(
+    replayed: RunStatistics, axis_result: AxisComparison, evaluated_spans_s: Spans
+) -> RunStatistics | None:
+    """Return the logged statistics of EKF2; None if those of the unchanged replay differ."""
+    ekf2, innovations = axis_result.ekf2_tracks, axis_result.ekf2_tracks.innovations
     if isinstance(ekf2.state, Unavailable) or isinstance(innovations, Unavailable):
-        return replayed, False
+        return None
     logged_state = rows_inside(ekf2.state, evaluated_spans_s)
     innovations = rows_inside(innovations, evaluated_spans_s)
     rejected_flags = innovations["rejected"].dropna()
@@ -311,7 +308,7 @@ def _find_statistics_of_unchanged_run(
         )
         if logged_value is not None
     )
-    return (logged, True) if is_replay_similar else (replayed, False)
+    return logged if is_replay_similar else None
 
 
 def _summarise_run(
@@ -339,27 +336,34 @@ def _rotate_direction(direction: Array, rotation_deg: float) -> Array:
 def _rerun_kf(
     comparison: Comparison, tuning: TuningByAxis, axis_result: AxisComparison, change: ChangedValues
 ) -> RunStatistics:
+    """Run KF along an axis with a change of its settings or of its data, and summarise the run."""
     axis, truth, ekf2_state = axis_result.axis, axis_result.truth, axis_result.ekf2_tracks.state
+    # The corrected time offset (clock_offset_s) is also a setting of KF
     kf_settings: dict[str, Any] = {
         name: change[name] for name in change if name in vars(Settings())
     }
     changed_settings = replace(comparison.settings, **kf_settings)
-    # Apply the corrections of the data in sequence: rotation, bias, outliers, time offset
+    # Apply the corrections of the data in sequence. 1. Rotation of the positions: project them onto
+    # the axis rotated in the opposite direction
     rotates_gnss_positions = ROTATION_KEY in change and comparison.source.origin.is_gnss
     if ROTATION_KEY in change:
         rotated_direction = _rotate_direction(axis.direction, change[ROTATION_KEY])
         measured_m = weighted_sum(comparison.source_samples, Columns.POSITION, rotated_direction)
         axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
         if rotates_gnss_positions:
-            # Rotating positions and ground truth has the same effect as correcting the heading
+            # GNSS positions are right, but the heading of KF's acceleration is wrong. Rotating
+            # positions and ground truth has the same effect as correcting the heading
             rotated_axis = replace(axis, direction=rotated_direction)
             truth = project_truth(comparison.flight.truth, rotated_axis, comparison.segment)
+    # 2. Accelerometer bias
     if FORWARD_BIAS_KEY in change:
         axis = replace(axis, acceleration=_remove_accelerometer_bias(comparison, change))
+    # 3. Outliers
     time_s, axis_tuning = axis.measurement_time_s, find_axis_tuning(tuning, axis.name)
     is_used = np.ones(len(time_s), dtype=bool)
     if OUTLIERS_KEY in change and axis_tuning is not None:
         is_used = ~np.isin(time_s, axis_tuning.outlier_time_s)
+    # 4. Time offset: the timestamps already contain the offset of the original run
     shift_s = changed_settings.clock_offset_s - comparison.settings.clock_offset_s
     axis = replace(
         axis,
@@ -394,22 +398,21 @@ def _replay_ekf2(
 ) -> Ekf2Replay:
     if not change:
         return model.baseline_replay
+    # A change contains parameters of EKF2, and corrections of the positions under other names
     changed_parameters = {name: value for name, value in change.items() if name in MODEL_PARAMETERS}
-    model_with_moved_positions = misalign_positions(
-        model, change.get(ROTATION_KEY, 0.0), change.get(TIME_OFFSET_KEY, 0.0)
-    )
-    # Convert the times of the outliers from KF's timestamps to the timestamps of the replay:
-    # subtract KF's time offset, add the delay that KF subtracts from GNSS timestamps, and add the
-    # time offset that the re-run tests
+    time_offset_s = change.get(TIME_OFFSET_KEY, 0.0)
+    model = misalign_positions(model, change.get(ROTATION_KEY, 0.0), time_offset_s)
     excluded_times_s, axis_tuning = None, find_axis_tuning(tuning, HORIZONTAL)
     if OUTLIERS_KEY in change and axis_tuning is not None:
-        excluded_times_s = axis_tuning.outlier_time_s - comparison.settings.clock_offset_s
+        # Outlier times are KF's timestamps. To find these positions in the replay, remove KF's time
+        # offset, and add the tested offset
+        excluded_times_s = (
+            axis_tuning.outlier_time_s - comparison.settings.clock_offset_s + time_offset_s
+        )
+        # For GNSS, KF's timestamps are earlier by the delay parameter than those of the replay
         if comparison.source.origin.is_fused_as_gnss:
             excluded_times_s += 1e-3 * model.inputs.settings[model.inputs.aid.delay]
-        excluded_times_s += change.get(TIME_OFFSET_KEY, 0.0)
-    (replay,) = replay_with_settings(
-        model_with_moved_positions, [changed_parameters], excluded_times_s
-    )
+    (replay,) = replay_with_settings(model, [changed_parameters], excluded_times_s)
     return replay
 
 
@@ -429,6 +432,7 @@ def _summarise_replay(
         # The re-run rotates the GNSS positions, and with them EKF2's frame. Rotate the evaluated
         # axis by the same angle (clockwise: a negative angle in _rotate_direction)
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION_KEY]))
+    # 1. Innovations S, R and P⁺ along the axis, from north and east
     cosines, updates = axis.direction[:2], rows_inside(ekf2_replay.updates, evaluated_spans_s)
     innovation_variance_m2, observation_variance_m2, posterior_variance_m2 = (
         weighted_sum(
@@ -436,7 +440,7 @@ def _summarise_replay(
         )
         for name in ("innovation_variance", "observation_variance", "position_variance")
     )
-    # P⁻ = S - R
+    # 2. Reported position variance, between P⁻ = S - R and P⁺
     prior_variance_m2 = innovation_variance_m2 - observation_variance_m2
     variance_by_time = pd.DataFrame(
         {
@@ -445,6 +449,7 @@ def _summarise_replay(
         },
         index=pd.Index(updates["fused_at_s"].to_numpy()),
     )
+    # 3. Track for the errors against ground truth, and track for the difference to KF
     published_track = project(ekf2_replay.published_state, axis, comparison.segment)
     published_track = rows_inside(published_track, evaluated_spans_s)
     logged_state, track_compared_with_kf = axis_result.ekf2_tracks.state, published_track

@@ -108,12 +108,14 @@ def detect_position_fusion_faults(comparison: Comparison) -> Findings:
 
 
 def detect_unfused_positions(analysis: PreparedComparison) -> Findings:
+    """Detect positions that EKF2 fuses only for a part of the time, or never."""
     ekf2, source = analysis.flight.ekf2, _find_received_source(analysis)
     if not isinstance(ekf2, Ekf2) or isinstance(ekf2.fusion_flags, Unavailable):
         return
     fusion_flag = ekf2.fusion_flags["horizontal"]
     fused_fraction = compute_flag_fraction(fusion_flag, analysis.segment)
-    if fused_fraction >= MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR:
+    is_mostly_fused = fused_fraction >= MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR
+    if is_mostly_fused:
         yield from _detect_slow_restart(analysis, fusion_flag)
     if source is None or fused_fraction >= MAX_FUSED_FRACTION_FOR_WARNING:
         return
@@ -127,7 +129,8 @@ def detect_unfused_positions(analysis: PreparedComparison) -> Findings:
         "fused_fraction": fused_fraction,
         "source_interval_s": 1.0 / source.compute_rate_hz(),
     }
-    if source.origin.aid is None:  # EKF2 does not read this topic
+    # Case 1: EKF2 does not read the topic of the positions
+    if source.origin.aid is None:
         if source.name == MOTION_CAPTURE_TOPIC and not fused_fraction:
             yield make_warning(
                 "ekf2_not_fusing",
@@ -138,6 +141,8 @@ def detect_unfused_positions(analysis: PreparedComparison) -> Findings:
                 evidence,
             )
         return
+    # In the other cases, find the condition of EKF2 that was not met in the longest time without
+    # fusion
     spans = find_spans_with_value(0.0, fusion_flag, analysis.segment)
     longest_span_s = max(spans, key=lambda span: span[1] - span[0])
     parameters = {**analysis.flight.log.parameters, **ekf2.parameters}
@@ -151,14 +156,15 @@ def detect_unfused_positions(analysis: PreparedComparison) -> Findings:
     if unmet_condition.fault:
         title += f": {unmet_condition.fault}"
     message = f"{title}. {unmet_condition.reason}"
-    if fused_fraction >= MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR:
+    # Case 2: EKF2 fused the positions, with interruptions
+    if is_mostly_fused:
         message += (
             f" For up to {longest_span_s[1] - longest_span_s[0]:.1f} s EKF2 relied on the IMU and "
             "other aiding sources."
         )
         yield make_warning("ekf2_fusion_interrupted", message, action, evidence, spans)
         return
-    # The user may have switched off GNSS, the usual source, on purpose
+    # Case 3: EKF2 hardly fused the positions. GNSS may be switched off on purpose
     is_disabled_gnss = source.origin.is_fused_as_gnss and condition == "switch"
     yield finding(
         "note" if is_disabled_gnss else "error",
@@ -184,11 +190,13 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
     is_valid = ekf2.status_flags.get("xy_valid")
     if is_valid is None or is_valid.empty:
         return
-    invalid_fraction = 1.0 - compute_flag_fraction(is_valid, analysis.segment)
-    if invalid_fraction <= 1.0 - MAX_FUSED_FRACTION_FOR_WARNING:
+    # The same limits as for the fraction of the time with fusion
+    valid_fraction = compute_flag_fraction(is_valid, analysis.segment)
+    if valid_fraction >= MAX_FUSED_FRACTION_FOR_WARNING:
         return
     spans = find_spans_with_value(0.0, is_valid, analysis.segment)
     distance_m = _find_largest_distance_m(analysis, ekf2, spans)
+    # An unknown distance (NaN) is reported, too
     if distance_m < MIN_INVALID_POSITION_ERROR_M:
         return
     reference = "ground truth" if isinstance(analysis.flight.truth, Truth) else "position source"
@@ -198,12 +206,12 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
             f" EKF2's invalid position is up to {format_metres(distance_m)} m from the {reference}."
         )
     yield finding(
-        error_if(invalid_fraction > 1.0 - MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR),
+        error_if(valid_fraction < MAX_FUSED_FRACTION_FOR_SEVERITY_ERROR),
         "ekf2_position_invalid",
-        f"EKF2's horizontal position is invalid {format_percent(invalid_fraction)} of the time "
+        f"EKF2's horizontal position is invalid {format_percent(1.0 - valid_fraction)} of the time "
         f"(xy_valid 0), and PX4 does not use this position.{distance_sentence}",
         "First restore the fusion of positions. Noise settings do not change the error.",
-        {"invalid_fraction": invalid_fraction, "distance_m": distance_m},
+        {"invalid_fraction": 1.0 - valid_fraction, "distance_m": distance_m},
         spans,
     )
 
@@ -429,10 +437,8 @@ def _find_large_height_error_m(analysis: Analysis, span_s: Span) -> float | None
         return None
     error_m = errors["error_m"].abs()
     error_in_span_m = error_m.loc[slice(*span_s)]
-    largest_error_m, other_errors_m = (
-        float(error_in_span_m.max()),
-        error_m.drop(error_in_span_m.index),
-    )
+    largest_error_m = float(error_in_span_m.max())
+    other_errors_m = error_m.drop(error_in_span_m.index)
     is_large = largest_error_m > MIN_GAP_ERROR_TO_HEIGHT_RMSE_RATIO * rms(other_errors_m)
     return largest_error_m if is_large else None
 

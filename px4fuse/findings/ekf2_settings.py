@@ -77,9 +77,10 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
     # EKF2 uses the larger of reported σ and noise parameter
     noise_setting_m = inputs.settings[parameter]
     uses_reported_sigma = used_noise_m > noise_setting_m
-    ratio = estimated_noise_m / used_noise_m
-    is_too_small = ratio >= 1.0
-    factor, size_word = (ratio, "small") if is_too_small else (1.0 / ratio, "large")
+    is_too_small = used_noise_m <= estimated_noise_m
+    factor = max(estimated_noise_m / used_noise_m, used_noise_m / estimated_noise_m)
+    size_word = "small" if is_too_small else "large"
+    # 1. Title: the sensor is too noisy, or the setting is wrong
     sensor_name = analysis.source.kind_name
     name = "EKF2's assumed measurement noise" if uses_reported_sigma else parameter
     # PX4's default suits usual sensors: if it is too small, this sensor is noisier
@@ -88,12 +89,14 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
         title = f"{sensor_name} noise is {format_factor(factor)} times the noise setting of EKF2"
     else:
         title = f"{name} is {format_factor(factor)} times too {size_word}"
+    # 2. Effect on EKF2: rejected positions, or a wrong gain
     rejected_fraction = analysis.main.rejected_fraction or 0.0
     if is_too_small and rejected_fraction >= MIN_REJECTED_FRACTION_IN_MESSAGE:
         title += f": EKF2 rejects {format_percent(rejected_fraction)} of the positions"
         reason = f"EKF2 rejects normal {sensor_name} noise as outliers."
     else:
         reason = f"EKF2's gain is too {'large' if is_too_small else 'small'}."
+    # 3. Estimate with its 95 % interval, if known
     interval_text, horizontal_tuning = "", analysis.tuning.get(HORIZONTAL)
     if isinstance(horizontal_tuning, AxisTuning):
         low_m, high_m = horizontal_tuning.sigma_z.low, horizontal_tuning.sigma_z.high
@@ -102,6 +105,7 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
         f"{title}. {name} is {used_noise_m:.3g} m; the maximum-likelihood estimate is "
         f"{estimated_noise_m:.3g} m{interval_text}. {reason}"
     )
+    # 4. Action: another parameter, or another reported variance
     action = f"Set {format_changes(select_changed_settings(rerun.change, inputs.settings))}."
     if uses_reported_sigma:
         mode_text = f" ({aid.noise_mode_parameter} 0)" if aid.noise_mode_parameter else ""
@@ -118,7 +122,7 @@ def detect_wrong_noise(analysis: Analysis) -> Findings:
         {
             "flown_m": used_noise_m,
             "estimate_m": estimated_noise_m,
-            "factor": ratio,
+            "factor": estimated_noise_m / used_noise_m,
             CAUSE_KEY: REPORTED_VARIANCE_USED_BY_EKF2_CAUSE if uses_reported_sigma else "",
         },
     )
@@ -201,6 +205,7 @@ def _prevents_rejections(rerun: Rerun) -> bool:
     return (
         before is not None
         and after is not None
+        # A re-run with two changes does not show which of them the user has to make
         and len(rerun.kinds) == 1
         and classify_improvement(rerun) != "nothing"
         and after < MAX_REJECTED_AFTER_TO_BEFORE_RATIO * before

@@ -118,17 +118,20 @@ def _detect_bias_at_limit(
 ) -> Findings:
     for parameter, unit, sensor, columns in BIAS_LIMIT_PARAMETERS:
         limit = ekf2.parameters.get(parameter, 0.0)
+        # Fraction of the time at the limit, of the axis with the largest fraction
         fractions = (bias_states[columns].abs() >= MIN_BIAS_TO_LIMIT_RATIO * limit).mean()
         axis_index = int(np.argmax(fractions))
         time_at_limit_fraction = float(fractions.iloc[axis_index])
         if limit <= 0.0 or time_at_limit_fraction < MIN_TIME_AT_LIMIT_FRACTION:
             continue
         median_bias = float(bias_states[columns[axis_index]].median())
+        is_vertical = BODY_AXES[axis_index] == "down"
         message = (
             f"EKF2's {sensor} bias is at its limit {parameter} {limit:.3g} {unit} for "
             f"{format_percent(time_at_limit_fraction)} of the flight. The bias estimate is "
             f"{median_bias:+.3g} {unit} {BODY_AXES[axis_index]}."
         )
+        # Other data that show the bias or its effect: IMU at rest, ground truth, and barometer
         if sensor == "accelerometer" and median_imu_at_rest is not None:
             force_m_s2 = np.linalg.norm(median_imu_at_rest[Columns.SPECIFIC_FORCE])
             if abs(force_m_s2 - constants.g) > MIN_GRAVITY_ERROR_M_S2:
@@ -137,14 +140,14 @@ def _detect_bias_at_limit(
                     f"instead of {constants.g:.2f} (bias {constants.g - force_m_s2:+.2f} m/s² "
                     "down)."
                 )
-        if axis_index == 2 and (down_comparison := analysis.axes.get("down")) is not None:
+        if is_vertical and (down_comparison := analysis.axes.get("down")) is not None:
             truth = down_comparison.filters["ekf2"].truth
             if isinstance(truth, ErrorsAgainstTruth):
                 message += (
                     " EKF2's height RMSE against ground truth is "
                     f"{format_metres(truth.position_rmse_m)} m."
                 )
-        if axis_index == 2 and (barometer_log := ekf2.aids.get(BAROMETER.name)) is not None:
+        if is_vertical and (barometer_log := ekf2.aids.get(BAROMETER.name)) is not None:
             innovations = cut_to_segment(barometer_log.samples, analysis.segment)[
                 f"innovation_{barometer_log.axes[0]}"
             ]

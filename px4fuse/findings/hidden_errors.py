@@ -92,8 +92,11 @@ def detect(analysis: Analysis) -> Findings:
 def make_hidden_error_finding(
     analysis: Analysis, errors_not_in_innovations: list[tuple[FilterName, str, ErrorAboveSigma]]
 ) -> Finding:
-    # Sort errors along the main axis before errors along other axes, but otherwise keep the order
-    # by size. The finding states the first error of each filter
+    """Make the finding on position errors above the reported σ, or on the drift that causes them.
+
+    ``errors_not_in_innovations`` are sorted, the largest first.
+    """
+    # Errors along the main axis first. Of each filter, only the first error is reported
     errors_not_in_innovations = sorted(
         errors_not_in_innovations, key=lambda entry: entry[1] != analysis.main.axis.name
     )
@@ -101,6 +104,7 @@ def make_hidden_error_finding(
     error_by_filter = dict[FilterName, tuple[str, ErrorAboveSigma]]()
     for filter_name, axis, error in errors_not_in_innovations:
         error_by_filter.setdefault(filter_name, (axis, error))
+    # 1. Texts, evidence and cause for each filter
     evidence: dict[str, float | str] = {"axis": worst_axis, "filter": worst_filter}
     ratio_texts, sentences = dict[str, str](), list[str]()
     rerun_by_filter = dict[FilterName, Rerun]()
@@ -124,9 +128,14 @@ def make_hidden_error_finding(
             f"{analysis.axes[axis].axis.label}, reported σ "
             f"{format_metres(error.reported_sigma_m)} m."
         )
-    # Cause of the worst error; if no re-run shows a cause, the cause of the other filter's error
-    cause = rerun_by_filter.get(worst_filter) or next(iter(rerun_by_filter.values()), None)
+    # 2. The cause of the worst error or, without it, that of the other filter's error
+    cause = (
+        rerun_by_filter.get(worst_filter)
+        or rerun_by_filter.get("kf")
+        or rerun_by_filter.get("ekf2")
+    )
     evidence[CAUSE_KEY] = classify_cause(analysis, cause)
+    # 3. Without a cause, test if an alignment with ground truth removes most of the error
     is_misaligned = False
     rmse_text = f"position RMSE {format_metres(worst_error.rmse_m)} m against ground truth"
     if cause is None and (alignment_rmse := _compute_alignment_rmse(analysis, worst_filter)):
@@ -140,6 +149,7 @@ def make_hidden_error_finding(
             "position_rmse_aligned_m": after_m,
         }
         is_misaligned = after_m < MAX_ALIGNED_TO_UNALIGNED_RMSE_RATIO * before_m
+    # 4. Remedy, in the order of certainty
     kf_errors = analysis.axes[worst_axis].filters["kf"].truth
     if cause is not None:
         remedy = format_action(analysis, cause.change)
@@ -148,6 +158,7 @@ def make_hidden_error_finding(
         remedy = FRAME_REMEDY
     elif analysis.source.origin.may_drift:
         return _make_drift_finding(analysis, rmse_text, evidence, tuple(ratio_texts))
+    # KF uses the same positions: if its error is smaller, the fault is in EKF2
     elif (
         error_by_filter.keys() == {"ekf2"}
         and isinstance(kf_errors, ErrorsAgainstTruth)
@@ -155,13 +166,7 @@ def make_hidden_error_finding(
     ):
         remedy = EKF2_HEIGHT_REMEDY if worst_axis == "down" else EKF2_REMEDY
     else:
-        remedy = "Check the time offset of the positions (px4fuse sync LOG)."
-        if isinstance(analysis.time_offset, Unavailable):
-            remedy = (
-                "A time offset of the positions is possible, but this log cannot show it: "
-                f"{analysis.time_offset.reason}. {analysis.time_offset.remedy}"
-            )
-        remedy += f" {find_source_texts(analysis).slow_error_check}."
+        remedy = _find_source_remedy(analysis)
     return finding(
         error_if(worst_error.nees >= MIN_NEES_FOR_SEVERITY_ERROR),
         "error_exceeds_reported_sigma",
@@ -170,6 +175,16 @@ def make_hidden_error_finding(
         remedy,
         evidence,
     )
+
+
+def _find_source_remedy(analysis: Analysis) -> str:
+    remedy = "Check the time offset of the positions (px4fuse sync LOG)."
+    if isinstance(analysis.time_offset, Unavailable):
+        remedy = (
+            "A time offset of the positions is possible, but this log cannot show it: "
+            f"{analysis.time_offset.reason}. {analysis.time_offset.remedy}"
+        )
+    return f"{remedy} {find_source_texts(analysis).slow_error_check}."
 
 
 def _make_drift_finding(
@@ -246,7 +261,7 @@ def make_possible_drift_finding(analysis: Analysis) -> Finding:
         "KF and EKF2 follow the drift, so innovations do not show the drift."
     )
     if isinstance(horizontal_tuning, AxisTuning) and (
-        noise_m := horizontal_tuning.sigma_z.value or horizontal_tuning.sigma_z.high
+        noise_m := horizontal_tuning.sigma_z.value_or_bound(0.0)
     ):
         bound_text = "at most " if horizontal_tuning.sigma_z.value is None else ""
         evidence["short_term_noise_m"] = noise_m

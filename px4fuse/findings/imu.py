@@ -1,5 +1,7 @@
 """Faults of the IMU data (bias, clipping, gaps, low rate), and excessive roll or pitch."""
 
+import math
+
 import numpy as np
 import pandas as pd
 from scipy import constants
@@ -89,8 +91,8 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
     """Detect an accelerometer bias, estimated from the positions or by EKF2."""
     systematic_errors = analysis.systematic_errors
     ekf2_bias_m_s2 = _find_ekf2_accelerometer_bias(analysis)
-    sensor_text, min_severe_bias_m_s2 = "accelerometers", MIN_SEVERE_BIAS_M_S2
-    evidence = dict[str, float]()
+    sensor_text, can_be_severe, evidence = "accelerometers", True, dict[str, float]()
+    # Case 1: horizontal bias, estimated from the positions
     if isinstance(systematic_errors, SystematicErrors) and systematic_errors.has_significant_bias():
         horizontal_bias = systematic_errors.compute_horizontal_bias()
         forward_bias = systematic_errors.forward_bias_m_s2
@@ -107,18 +109,20 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
                 f" EKF2's bias estimate is {forward:+.2f} m/s² forward and {right:+.2f} m/s² right."
             )
         sensor_text = "accelerometers and the level horizon"
+    # Case 2: EKF2's estimate. It has no effect on EKF2, which corrects the bias
     elif ekf2_bias_m_s2 is not None:
-        forward, right, down = tested_bias_m_s2 = ekf2_bias_m_s2
+        can_be_severe = False
+        forward, right, down = ekf2_bias_m_s2
+        bias_m_s2 = math.hypot(*ekf2_bias_m_s2)
         # The positions show no significant horizontal bias: test only the vertical bias
         if isinstance(systematic_errors, SystematicErrors):
-            tested_bias_m_s2 = [down]
-        bias_m_s2 = float(np.linalg.norm(tested_bias_m_s2))
+            bias_m_s2 = abs(down)
         message = (
             f"EKF2 estimates an accelerometer bias of {bias_m_s2:.2f} m/s²: {forward:+.2f} "
             f"forward, {right:+.2f} right and {down:+.2f} down."
         )
-        min_severe_bias_m_s2 = np.inf  # a bias that EKF2 estimates does not affect EKF2
-    else:  # test the vertical accelerometer bias with the heights of the source
+    # Case 3: vertical bias, estimated from the heights of the source
+    else:
         error_m_s2 = 0.0
         if (result := analysis.axes.get("down")) is not None:
             error_m_s2 = estimate_mean_acceleration_error(result.axis) or 0.0
@@ -130,7 +134,7 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
         )
     if bias_m_s2 >= MIN_REPORTED_ACCELEROMETER_BIAS_M_S2:
         yield finding(
-            error_if(bias_m_s2 >= min_severe_bias_m_s2),
+            error_if(can_be_severe and bias_m_s2 >= MIN_SEVERE_BIAS_M_S2),
             "accelerometer_bias",
             f"{message} KF does not estimate biases.",
             f"Calibrate the {sensor_text} at the temperature of the flight.",
@@ -186,13 +190,10 @@ def detect_clipping(analysis: Analysis) -> Findings:
 
 def detect_imu_gaps(analysis: Analysis) -> Findings:
     gap_s, imu, log = analysis.main.kf_run.input_gap_s, analysis.flight.imu, analysis.flight.log
-    interval_s, spans = 0.0, tuple[Span, ...]()
-    if not isinstance(imu, Unavailable):
-        interval_s, spans = (
-            1.0 / compute_sample_rate_hz(imu),
-            _find_gap_spans(imu, analysis.segment),
-        )
-    if gap_s > max(MIN_REPORTED_IMU_GAP_S, 2.0 * interval_s):
+    if isinstance(imu, Unavailable):
+        return
+    spans = _find_gap_spans(imu, analysis.segment)
+    if gap_s > max(MIN_REPORTED_IMU_GAP_S, 2.0 / compute_sample_rate_hz(imu)):
         action = ""
         if log.format.startswith("MAVLink"):
             action = "Record on a link without message loss. "

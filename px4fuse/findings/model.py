@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -183,6 +184,7 @@ def split_cause_groups(findings: Iterable[Finding]) -> list[list[Finding]]:
 
 def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Sort findings by severity; each cause is followed by its effects."""
+    # A group is a finding, followed by its effects. At first, most groups are single findings
     ids = list(FINDING_CATALOGUE)
     groups = sorted(split_cause_groups(findings), key=lambda group: ids.index(group[0].id))
     for cause, effects_text in EFFECTS_BY_CAUSE.items():
@@ -195,16 +197,19 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
             or WHITE_TO_ASSUMED_NOISE_RATIO_KEY in cause_group[0].evidence
         ):
             continue
-        effects, severity = effects_text.splitlines(), cause_group[0].severity
-        for group in [group for group in groups if group is not cause_group]:
+        # Lines are ids, or "id: kind of cause" if the evidence of the effect must state this kind
+        effect_lines, severity = effects_text.splitlines(), cause_group[0].severity
+        for group in groups.copy():
             effect, *effects_of_effect = group
-            if effect.id in effects or f"{effect.id}: {effect.evidence.get(CAUSE_KEY)}" in effects:
-                # The finding and its effects move to the group of the cause
-                groups.remove(group)
-                cause_group += [replace(effect, caused_by=cause), *effects_of_effect]
-                # A cause is as severe as its effects, except the effects on KF
-                if effect.id not in _KF_FINDINGS:
-                    severity = min(severity, effect.severity, key=SEVERITIES.index)
+            possible_lines = {effect.id, f"{effect.id}: {effect.evidence.get(CAUSE_KEY)}"}
+            if group is cause_group or possible_lines.isdisjoint(effect_lines):
+                continue
+            # The finding and its effects move to the group of the cause
+            groups.remove(group)
+            cause_group += [replace(effect, caused_by=cause), *effects_of_effect]
+            # A cause is as severe as its effects, except the effects on KF
+            if effect.id not in _KF_FINDINGS:
+                severity = min(severity, effect.severity, key=SEVERITIES.index)
         cause_group[0] = replace(cause_group[0], severity=severity)
     findings = list[Finding]()
     for cause_finding, *effect_findings in sorted(groups, key=_compute_report_rank):
@@ -225,21 +230,24 @@ def find_effect_ids(cause: str) -> tuple[str, ...]:
 
 
 def _compute_report_rank(group: list[Finding]) -> int:
+    """Return the place of a group in the report.
+
+    0 faults that make other findings wrong, 1 errors, 2 warnings about the recording, 3 errors of
+    noise settings (a bad recording makes noise estimates wrong), 4 other warnings, 5 notes.
+    """
     cause = group[0]
     report_class = FINDING_CATALOGUE[cause.id].report_class
     if cause.severity == "note":
-        return 4
+        return 5
     if WRONG_CONVENTION_KEY in cause.evidence or report_class in (
         "unusable",
         "misleading",
         "first",
     ):
-        return -1
-    # A bad recording makes the noise estimates wrong, so warnings about the recording precede
-    # errors about noise settings
+        return 0
     if cause.severity == "error":
-        return 2 if report_class == "noise" else 0
-    return 1 if report_class == "recording" else 3
+        return 3 if report_class == "noise" else 1
+    return 2 if report_class == "recording" else 4
 
 
 def make_zero_length_spans(times_s: Iterable[float]) -> tuple[Span, ...]:
@@ -263,11 +271,11 @@ def find_spans_with_value(
     value: float, step_function: pd.Series, segment: Segment
 ) -> tuple[Span, ...]:
     """Return the time spans (s) in a segment in which a step function equals ``value``."""
-    edges_s = np.append(step_function.index, np.inf)
-    edges_s[0] = -np.inf
-    has_value = np.pad(step_function == value, 1)
-    change_times_s = edges_s[has_value[1:] != has_value[:-1]].tolist()
-    return segment.clip_spans(zip(change_times_s[::2], change_times_s[1::2], strict=True))
+    changes = step_function[step_function.diff() != 0.0]
+    # Each value applies until the next change, the first value also before its time
+    edges_s = [-np.inf, *changes.index[1:], np.inf]
+    spans_and_values = zip(pairwise(edges_s), changes, strict=False)
+    return segment.clip_spans(span_s for span_s, each in spans_and_values if each == value)
 
 
 def compute_flag_fraction(step_function: pd.Series, segment: Segment) -> float:

@@ -26,7 +26,6 @@ from px4fuse.comparison.rerun_effects import (
 from px4fuse.comparison.reruns import is_inconsistent
 from px4fuse.core.text import format_factor, format_number, format_ratio
 from px4fuse.filter.settings import SETTING_RANGES, Settings
-from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.finding import SEVERITIES, Finding, Severity
 from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, MODEL_PARAMETERS
@@ -124,8 +123,8 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
     if has_little_motion(analysis):  # without motion SIGMA_A cannot be estimated
         del noise_estimates[SIGMA_A_KEY]
     may_drift = analysis.source.origin.may_drift
-    # Innovations do not show drift and time-correlated errors, so a setting above the estimate may
-    # be correct
+    # The estimates are from innovations, which do not show drift and time-correlated errors. A
+    # larger setting may be correct for odometry, for GNSS, and if KF's error exceeds its σ
     may_setting_exceed_estimate = (
         may_drift
         or analysis.source.origin.is_gnss
@@ -139,14 +138,16 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
             continue
         if may_setting_exceed_estimate and setting >= deviation.estimate:
             continue
+        # For a source that may drift, report only large deviations
         if may_drift and deviation.severity == "note":
             continue
         setting_finding = _make_setting_finding(analysis, axis_tuning, name, noise, deviation)
-        rank = SEVERITIES.index(setting_finding.severity), -deviation.factor
-        findings.append((rank, setting_finding))
-    # SIGMA_Z and SIGMA_A are estimated together: the more severe finding is the cause of the other
+        findings.append((deviation.factor, setting_finding))
+    # SIGMA_Z and SIGMA_A are estimated together: the more severe finding (or, of equal severity,
+    # the larger deviation) is the cause of the other
+    findings.sort(key=lambda item: (SEVERITIES.index(item[1].severity), -item[0]))
     cause = None
-    for _, setting_finding in sorted(findings, key=lambda item: item[0]):
+    for _, setting_finding in findings:
         yield structs.replace(setting_finding, caused_by=cause)
         cause = cause or setting_finding.id
 
@@ -223,15 +224,17 @@ def find_setting_deviation(
     name: str, setting: float, noise_estimate: NoiseEstimate
 ) -> SettingDeviation | None:
     """Return the deviation of a noise setting from its estimate, if it is significant."""
-    low, estimate, high = noise_estimate.low, noise_estimate.value, noise_estimate.high
-    if estimate is None:  # only an upper bound is known
-        low, estimate = 0.0, high
+    # An unknown end of the 95 % interval is 0 or infinite
+    low, high = noise_estimate.low or 0.0, noise_estimate.high or np.inf
+    estimate = noise_estimate.value
+    if estimate is None:  # only an upper bound is known: compare the setting with this bound
+        low, estimate = 0.0, noise_estimate.high
     if not estimate:
         return None
-    # Widen the 95 % interval on the logarithmic scale
+    # Widen the 95 % interval by a factor on the logarithmic scale:
+    # ln(new end) = ln(estimate) + factor · (ln(end) - ln(estimate))
     low, high = (
-        estimate * (end / estimate) ** CONFIDENCE_INTERVAL_WIDENING_FACTOR
-        for end in (low or 0.0, high or np.inf)
+        estimate * (end / estimate) ** CONFIDENCE_INTERVAL_WIDENING_FACTOR for end in (low, high)
     )
     factor = max(setting / estimate, estimate / setting)
     if low <= setting <= high or factor < MIN_NOISE_SETTING_TO_ESTIMATE_FACTOR:
@@ -244,6 +247,7 @@ def find_setting_deviation(
 
 def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
     """Detect a SIGMA_A so small that KF ignores new positions."""
+    # The axis of largest motion is first (False is sorted before True). Report only one axis
     for result in sorted(analysis.axes.values(), key=lambda result: result is not analysis.main):
         updates, summary = result.kf_run.updates, result.filters["kf"]
         # A small SIGMA_A is wrong only if KF is overconfident and lags: without motion, it is
@@ -254,6 +258,8 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
             or summary.lag1_autocorrelation < MIN_INNOVATION_LAG1_AUTOCORRELATION
         ):
             continue
+        # Gain of the second half of the flight, after convergence. Each update removes the fraction
+        # `gain` of a deviation, so deviations decrease with the time constant 1 / (rate · gain)
         gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
         time_constant_s = 1.0 / (compute_sample_rate_hz(updates) * gain)
         if time_constant_s < MIN_KF_TIME_CONSTANT_S:
@@ -331,44 +337,37 @@ def _explain_wrong_sigma(
     analysis: Analysis, filter_name: FilterName, result: AxisComparison, summary: FilterSummary
 ) -> tuple[str, str, bool]:
     """Return cause and remedy of a wrong σ, and True if it is no fault (severity note)."""
-    source = analysis.source
+    source, is_ekf2 = analysis.source, filter_name == "ekf2"
     is_underconfident = summary.sigma_ratio < 1.0
-    # A filter with too small innovations may have slow errors, which only ground truth shows
-    if is_underconfident and not summary.is_underconfident_against_truth:
-        if source.origin.may_drift:
-            return UNKNOWN_CAUSE, KEEP_NOISE_BECAUSE_OF_DRIFT_ACTION, True
-        if source.origin.is_gnss:
-            is_barometer = source.aid(result.axis.name) == BAROMETER
-            if (
-                filter_name == "ekf2"
-                and not is_barometer
-                and (remedy_text := _format_action_for_excessive_noise(analysis))
-            ):
-                return MEASUREMENT_NOISE_CAUSE, remedy_text, False
-            remedy_text = KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(
-                sensor="a barometer" if is_barometer else "GNSS"
-            )
-            return UNKNOWN_CAUSE, remedy_text, True
-    if is_underconfident:
-        if filter_name == "ekf2" and (remedy_text := _explain_noise_minimum(analysis)):
-            return UNKNOWN_CAUSE, remedy_text, True
-        if any(name == filter_name for name, *_ in find_hidden_errors(analysis)):
-            return UNKNOWN_CAUSE, KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION, False
+    # 1. Too small innovations do not prove a fault: slow errors, which only ground truth shows, may
+    # require the large σ
+    may_have_slow_errors = is_underconfident and not summary.is_underconfident_against_truth
+    if may_have_slow_errors and source.origin.may_drift:
+        return UNKNOWN_CAUSE, KEEP_NOISE_BECAUSE_OF_DRIFT_ACTION, True
+    if may_have_slow_errors and source.origin.is_gnss:
+        is_barometer = source.aid(result.axis.name) == BAROMETER
+        # EKF2's noise is a fault if it exceeds both the estimate and the noise that GNSS reports
+        action = _format_action_for_excessive_noise(analysis)
+        if is_ekf2 and not is_barometer and action:
+            return MEASUREMENT_NOISE_CAUSE, action, False
+        sensor = "a barometer" if is_barometer else "GNSS"
+        return UNKNOWN_CAUSE, KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(sensor=sensor), True
+    # 2. Reasons why a smaller noise is not possible, or not right along another axis
+    if is_underconfident and is_ekf2 and (action := _explain_noise_minimum(analysis)):
+        return UNKNOWN_CAUSE, action, True
+    if is_underconfident and any(name == filter_name for name, *_ in find_hidden_errors(analysis)):
+        return UNKNOWN_CAUSE, KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION, False
+    # 3. Re-runs show the cause. No fault are a σ that ground truth requires, and SIGMA_Z of GNSS,
+    # which px4fuse takes from EKF2
     rerun = find_cause_rerun(analysis.reruns, filter_name, result.axis.name)
-    remedy_text = _find_action_for_wrong_sigma(analysis, filter_name, result, rerun)
-    is_kf_noise_of_receiver = filter_name != "ekf2" and is_underconfident and source.origin.is_gnss
-    return (
-        classify_cause(analysis, rerun),
-        remedy_text,
-        is_kf_noise_of_receiver or remedy_text == KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION,
-    )
+    action = _find_action_for_wrong_sigma(analysis, filter_name, result, rerun)
+    is_kf_noise_from_ekf2 = is_underconfident and not is_ekf2 and source.origin.is_gnss
+    is_note = is_kf_noise_from_ekf2 or action == KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION
+    return classify_cause(analysis, rerun), action, is_note
 
 
 def _find_reported_noise_m(analysis: Analysis) -> float:
-    reported_variance = cut_to_segment(analysis.source.samples, analysis.segment)[
-        Columns.POSITION_VARIANCE[0]
-    ]
-    return float(np.sqrt(reported_variance.median()))
+    return float(np.sqrt(analysis.source_samples[Columns.POSITION_VARIANCE[0]].median()))
 
 
 def _format_action_for_excessive_noise(analysis: Analysis) -> str:
@@ -457,25 +456,24 @@ def _find_action_for_wrong_sigma(
 def _find_sigma_action_without_replay(
     analysis: Analysis, result: AxisComparison, axis_tuning: AxisTuning
 ) -> str:
-    """Return the action against a wrong σ of EKF2 if EKF2 cannot be replayed.
-
-    The action sets EKF2's measurement noise to the estimated position noise, if this changes σ in
-    the right direction.
-    """
-    aid, noise = find_aid(analysis, result.axis.name), axis_tuning.sigma_z
-    ekf2_summary = result.filters["ekf2"]
+    """Return the change of EKF2's noise to its estimate, if EKF2 cannot be replayed."""
+    aid, ekf2_summary = find_aid(analysis, result.axis.name), result.filters["ekf2"]
     assert not isinstance(ekf2_summary, Unavailable)
-    if not (estimated_noise_m := noise.value or noise.high):
+    estimated_noise_m = axis_tuning.sigma_z.value_or_bound(0.0)
+    if not estimated_noise_m:
         return UNEXPLAINED_SIGMA_ACTION
     noise_m, used_noise_m = max(estimated_noise_m, EKF2_MIN_NOISE_M), find_ekf2_noise_m(result)
-    # Above 1 if the estimate is on the right side of the used noise: smaller if EKF2 is
-    # underconfident, larger if EKF2 is overconfident
-    ratio = used_noise_m / noise_m if ekf2_summary.sigma_ratio < 1.0 else noise_m / used_noise_m
+    # A change to the estimate corrects an underconfident EKF2 only if it reduces the noise, and an
+    # overconfident EKF2 only if it increases the noise. The ratio is then above 1
+    is_underconfident = ekf2_summary.sigma_ratio < 1.0
+    ratio = used_noise_m / noise_m if is_underconfident else noise_m / used_noise_m
     if not ratio > MAX_RATIO_OF_EQUAL_NOISES:  # the comparison is False for NaN
         return (
             f"Keep EKF2's measurement noise ({used_noise_m:.2g} m): it agrees with the estimate. "
             "Check the time offset (px4fuse sync LOG) and the IMU (gaps, vibration)."
         )
+    # If EKF2 used more noise than its parameter, it used the variances in the messages. A smaller
+    # noise then also requires that EKF2 ignores these variances (make_noise_change)
     parameters, reported_noise_m = analysis.flight.log.parameters, 0.0
     noise_setting_m = parameters.get(aid.noise, np.inf)
     # If the used noise exceeds the noise parameter, EKF2 used the variances in the messages

@@ -39,6 +39,7 @@ def detect_time_offset(analysis: Analysis, time_offset: SourceTimeOffset) -> Fin
     if find_low_pass(analysis) is not None:  # a low-pass filter delays positions, not timestamps
         return
     low_s, high_s = time_offset.interval_s
+    # The evidence contains the total offset, with the part that --clock-offset already corrects
     evidence = {
         "offset_s": time_offset.offset_s,
         "interval_low_s": low_s,
@@ -64,6 +65,7 @@ def detect_time_offset(analysis: Analysis, time_offset: SourceTimeOffset) -> Fin
         or truth_refutes_offset(find_offset_rerun(analysis))
     ):
         return
+    # The message states the part of the offset that is not yet corrected, as a positive number
     offset_s, low_s, high_s = (
         value - time_offset.applied_s for value in (time_offset.offset_s, low_s, high_s)
     )
@@ -146,28 +148,28 @@ def detect_wrong_delay(analysis: Analysis, time_offset: SourceTimeOffset) -> Fin
         return
     source, delay_ms = analysis.source, remedy.find_logged_delay_ms(analysis)
     is_gnss = source.origin.is_fused_as_gnss
-    if (
-        not (source.origin.is_vision or is_gnss)
-        or delay_ms is None
-        # detect_time_offset reports a wrong EKF2_GPS_DELAY, unless --clock-offset corrects it
-        or (is_gnss and time_offset.is_significant(time_offset.remaining_s))
-    ):
+    if delay_ms is None or not (source.origin.is_vision or is_gnss):
+        return
+    # detect_time_offset reports a wrong EKF2_GPS_DELAY, unless --clock-offset corrects it
+    if is_gnss and time_offset.is_significant(time_offset.remaining_s):
         return
     estimated_delay_ms = remedy.estimate_delay_if_not_as_logged_ms(analysis, time_offset, delay_ms)
     if estimated_delay_ms is None:
         return
-    # The time offset of late timestamps is negative, the delay positive
+    # Delay = assumed delay - time offset, so the largest offset is the smallest delay
     low_ms, high_ms = (
         1e3 * (source.assumed_delay_s - offset_s) for offset_s in reversed(time_offset.interval_s)
     )
     if low_ms <= 0.0 <= high_ms:
         delay_text = "the positions have no significant delay"
-    elif estimated_delay_ms < 0.0:
+    elif estimated_delay_ms < 0.0:  # state how early the timestamps are, as a positive number
         delay_text = f"the timestamps are {-estimated_delay_ms:.0f} ms early"
         low_ms, high_ms = -high_ms, -low_ms
     else:
         delay_text = f"the positions are {estimated_delay_ms:.0f} ms late"
     parameter = remedy.find_aid(analysis).delay
+    # Action if the parameter cannot correct the delay: PX4 does not permit the value, or a re-run
+    # with it does not help
     if not is_gnss:
         finding_id, action = "ekf2_ev_delay_wrong", CORRECT_AT_SENDER_ACTION
         evidence = {"ekf2_ev_delay_ms": delay_ms, "asked_ms": estimated_delay_ms}

@@ -73,72 +73,65 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
     The convention comprises axes, unit, clock and orientation. Findings on EKF2 are kept and marked
     as effects.
     """
+    # 1. Causes: findings of faults that make other findings wrong
     faults = analysis.convention_faults
-    cause_findings = [item for item in findings if WRONG_CONVENTION_KEY in item.evidence]
-    findings_of_unusable_positions = [
+    causes = [item for item in findings if WRONG_CONVENTION_KEY in item.evidence]
+    unusable_positions = [
         item for item in findings if FINDING_CATALOGUE[item.id].report_class == "unusable"
     ]
-    effects = [
-        item
-        for item in findings
-        if FINDING_CATALOGUE[item.id].status_if_convention_wrong == "effect"
-    ]
-    if findings_of_unusable_positions:
-        # If positions are unusable, a convention (axes, unit, ...) estimated from them is not
-        # valid, nor are other findings from positions. Exception: a wrong lever arm does not affect
-        # the heading of the orientation, so the finding on the orientation remains
-        if {item.id for item in findings_of_unusable_positions} != {"source_lever_arm"}:
-            cause_findings = []
-        cause_findings = [
-            *(item for item in cause_findings if item.id == "source_orientation_wrong"),
-            *findings_of_unusable_positions,
-        ]
-        findings = [
+    if unusable_positions:
+        # A convention found with unusable positions is not valid. But a lever arm does not change
+        # the heading of the orientation
+        is_only_lever_arm = {item.id for item in unusable_positions} == {"source_lever_arm"}
+        causes = [
+            item for item in causes if is_only_lever_arm and item.id == "source_orientation_wrong"
+        ] + unusable_positions
+    else:
+        # A copied orientation alone does not affect other findings
+        if faults.orientation == "copied" and not faults.has_position_fault:
+            causes = []
+        causes += [
             item
             for item in findings
-            if item in cause_findings
-            or item in effects
-            or (
-                FINDING_CATALOGUE[item.id].group in POSITION_INDEPENDENT_FINDING_GROUPS
-                and item.id != "accelerometer_bias"
-            )
+            if FINDING_CATALOGUE[item.id].report_class == "misleading"
+            or RESET_TIME_KEY in item.evidence
         ]
-    elif faults.orientation == "copied" and not faults.has_position_fault:
-        # an orientation that is a copy of EKF2's attitude does not affect other findings
-        cause_findings = []
-    cause_findings += [
-        item
-        for item in findings
-        if FINDING_CATALOGUE[item.id].report_class == "misleading"
-        or RESET_TIME_KEY in item.evidence
-    ]
-    if not cause_findings:
+    if not causes:
         return [*findings]
-    other_findings = [
-        item
-        for item in findings
-        if item not in cause_findings
-        and FINDING_CATALOGUE[item.id].status_if_convention_wrong != "withdrawn"
-        # a drifting clock has no constant time offset
-        and not (faults.clock_drift and item.id == "source_time_offset")
-    ]
-    # With unknown axes, findings that need the positions are not valid
-    if faults.is_ambiguous and not findings_of_unusable_positions:
-        return cause_findings + [
-            item for item in other_findings if item in effects or item.severity == "note"
-        ]
-    first_cause, *other_causes = cause_findings
+    # 2. Effects of the causes, and findings that are valid in spite of the causes
+    effects, valid_findings = list[Finding](), list[Finding]()
+    for item in findings:
+        entry = FINDING_CATALOGUE[item.id]
+        # A drifting clock has no constant time offset
+        has_no_offset = faults.clock_drift and item.id == "source_time_offset"
+        if item in causes or has_no_offset or entry.status_if_convention_wrong == "withdrawn":
+            continue
+        if entry.status_if_convention_wrong == "effect":
+            effects.append(item)
+        elif unusable_positions:  # findings from positions are not valid
+            if (
+                entry.group in POSITION_INDEPENDENT_FINDING_GROUPS
+                and item.id != "accelerometer_bias"
+            ):
+                valid_findings.append(item)
+        # With unknown axes, warnings and errors may be due to wrong axes
+        elif not faults.is_ambiguous or item.severity == "note":
+            valid_findings.append(item)
+    # With unknown axes, it is not known which findings are effects: mark none of them
+    if faults.is_ambiguous and not unusable_positions:
+        return causes + [item for item in findings if item in effects or item in valid_findings]
+    first_cause, *other_causes = causes
     return [
         first_cause,
         # Findings on EKF2 become effects of the wrong convention. Those with another cause are
         # omitted, because they may be absent with the right convention
         *(
             replace(item, message=f"{item.title}.", caused_by=first_cause.id)
-            for item in other_findings
-            if item in effects and item.caused_by is None
+            for item in effects
+            if item.caused_by is None
         ),
         *other_causes,
-        *(item for item in other_findings if item not in effects),
+        *valid_findings,
     ]
 
 
@@ -153,64 +146,7 @@ def _detect_position_faults(
         "other tested combinations (log likelihood ratio to the second best: "
         f"{'above ' if log_odds == 99.0 else ''}{log_odds:.0f} nats)."
     )
-    stated_frame = source.alignment.frame.upper() if source.alignment else "NED"
-    axes = find_axes_in_file(convention.axes, stated_frame)
-    rotation_deg = faults.rotation_deg
-    # If positions of a file are rotated by a multiple of 90° relative to a usual frame, such as
-    # ENU, the user must choose another --position-frame
-    is_file_in_other_frame = (
-        rotation_deg
-        and is_position_file
-        and abs(convention.rotation_deg) <= MIN_RESIDUAL_ROTATION_DEG
-        and axes in FRAME_AXES.values()
-    )
-    if faults.has_wrong_axes or is_file_in_other_frame:
-        orientation = convention.orientation
-        frame_sentence = "The analysis uses the positions converted to NED."
-        # If EKF2 took its heading from the position source, the direction of north is unknown. The
-        # best guess for the frame of the positions is the frame of the orientation
-        if faults.is_north_unknown and orientation and axes not in FRAME_AXES.values():
-            axes = FRAME_AXES.get(orientation.frames[-3:], axes)
-            frame_sentence = (
-                "EKF2 took its heading from the position source, so the direction of north is "
-                "unknown."
-            )
-        fault_text, action = describe_axes(
-            axes, stated_frame, is_mirrored=convention.is_mirrored, is_file=is_position_file
-        )
-        if faults.has_wrong_axes and rotation_deg:
-            fault_text += f". The frame is also rotated clockwise by {rotation_deg:+.0f}°"
-        if orientation and orientation.frames.startswith("FLU"):
-            action += f" {describe_quaternion_conversion(orientation.frames)}"
-        yield make_error(
-            "source_axes_wrong",
-            f"{fault_text}. {evidence_sentence} {frame_sentence}",
-            action,
-            _make_evidence(convention, "axes"),
-        )
-    elif rotation_deg:
-        reference_text = {
-            "EKF2": "EKF2's heading",
-            "gyroscopes": "the heading at take-off",
-            "GNSS": "the GNSS positions",
-        }[convention.heading_from]
-        other_cause_text = (
-            "" if convention.heading_from == "GNSS" else f", or {reference_text} is wrong"
-        )
-        action = (
-            "Align the frame of the source with north, or rotate positions and orientation by "
-            f"{-rotation_deg:+.0f}° before sending."
-        )
-        if is_position_file:
-            action = "Run again with --position-yaw auto."
-        yield make_error(
-            "source_frame_misaligned",
-            f"{positions_text} are rotated by {rotation_deg:+.0f}° (clockwise from above) "
-            f"relative to {reference_text}. The x axis of the source does not point north"
-            f"{other_cause_text}. {evidence_sentence} The analysis rotates the positions to NED.",
-            action,
-            _make_evidence(convention, "rotation") | {"misalignment_deg": rotation_deg},
-        )
+    yield from _detect_wrong_axes_or_rotation(convention, faults, source, evidence_sentence)
     if faults.has_wrong_unit:
         fault_text, action = describe_wrong_unit(
             convention.unit, positions_text, is_file=is_position_file
@@ -256,6 +192,68 @@ def _detect_position_faults(
             f"{NO_ESTIMATES_SENTENCE}",
             "Fly a square with climb and descent, or state the frame (--position-frame).",
             _make_evidence(convention, "ambiguous"),
+        )
+
+
+def _detect_wrong_axes_or_rotation(
+    convention: Convention, faults: ConventionFaults, source: PositionTrack, evidence_sentence: str
+) -> Findings:
+    is_position_file, rotation_deg = source.alignment is not None, faults.rotation_deg
+    stated_frame = source.alignment.frame.upper() if source.alignment else "NED"
+    axes = find_axes_in_file(convention.axes, stated_frame)
+    # A rotated file whose axes are a usual frame, such as ENU, only needs another --position-frame
+    is_file_in_other_frame = (
+        rotation_deg
+        and is_position_file
+        and abs(convention.rotation_deg) <= MIN_RESIDUAL_ROTATION_DEG
+        and axes in FRAME_AXES.values()
+    )
+    if faults.has_wrong_axes or is_file_in_other_frame:
+        orientation = convention.orientation
+        frame_sentence = "The analysis uses the positions converted to NED."
+        # Without north, the axes are known only up to a rotation. The best guess for the frame of
+        # the positions is then the frame of the orientations ("FLU to ENU": ENU)
+        if faults.is_north_unknown and orientation and axes not in FRAME_AXES.values():
+            axes = FRAME_AXES.get(orientation.frames[-3:], axes)
+            frame_sentence = (
+                "EKF2 took its heading from the position source, so the direction of north is "
+                "unknown."
+            )
+        fault_text, action = describe_axes(
+            axes, stated_frame, is_mirrored=convention.is_mirrored, is_file=is_position_file
+        )
+        if faults.has_wrong_axes and rotation_deg:
+            fault_text += f". The frame is also rotated clockwise by {rotation_deg:+.0f}°"
+        if orientation and orientation.frames.startswith("FLU"):
+            action += f" {describe_quaternion_conversion(orientation.frames)}"
+        yield make_error(
+            "source_axes_wrong",
+            f"{fault_text}. {evidence_sentence} {frame_sentence}",
+            action,
+            _make_evidence(convention, "axes"),
+        )
+    elif rotation_deg:
+        reference_text = {
+            "EKF2": "EKF2's heading",
+            "gyroscopes": "the heading at take-off",
+            "GNSS": "the GNSS positions",
+        }[convention.heading_from]
+        other_cause_text = (
+            "" if convention.heading_from == "GNSS" else f", or {reference_text} is wrong"
+        )
+        action = (
+            "Align the frame of the source with north, or rotate positions and orientation by "
+            f"{-rotation_deg:+.0f}° before sending."
+        )
+        if is_position_file:
+            action = "Run again with --position-yaw auto."
+        yield make_error(
+            "source_frame_misaligned",
+            f"{source.positions_text} are rotated by {rotation_deg:+.0f}° (clockwise from above) "
+            f"relative to {reference_text}. The x axis of the source does not point north"
+            f"{other_cause_text}. {evidence_sentence} The analysis rotates the positions to NED.",
+            action,
+            _make_evidence(convention, "rotation") | {"misalignment_deg": rotation_deg},
         )
 
 

@@ -25,6 +25,7 @@ from .model import (
     error_if,
     finding,
     magnetometer_advice,
+    make_error,
     make_note,
     make_warning,
 )
@@ -100,25 +101,25 @@ def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Find
         MIN_MISALIGNMENT_SIGMAS * sigma_deg, MIN_HEADING_ERROR_DEG
     ):
         return
-    is_frame_of_ekf2 = source.name == ALIGNED_VISION_TOPIC
+    finding_id, reference = "ekf2_heading_error", "EKF2's heading"
+    advice = magnetometer_advice(analysis.flight)
     if source.origin.is_gnss:
         reason = "GNSS positions refer to true north, so EKF2's heading is wrong by this rotation."
         _, action = _explain_gnss_heading_error(analysis)
-    elif is_frame_of_ekf2:
+        advice = ""  # the action above is complete
+    elif source.name == ALIGNED_VISION_TOPIC:
         reason = "The positions that EKF2 rotated into its own frame do not fit the IMU."
         action = "Align the positioning frame with north."
     else:
+        finding_id, reference = "source_frame_misaligned", "the IMU"
         reason = (
             "The positioning frame is not aligned with north, or the magnetic heading is wrong."
         )
         action = f"Rotate the positions by {-rotation_deg:+.0f}° before they are sent."
         if source.alignment is not None:
             action = "Run again with --position-yaw auto."
-    if not source.origin.is_gnss and (advice := magnetometer_advice(analysis.flight)):
+    if advice:
         action += f" Alternatively: {lowercase_first_letter(advice)}"
-    finding_id, reference = "source_frame_misaligned", "the IMU"
-    if source.origin.is_gnss or is_frame_of_ekf2:
-        finding_id, reference = "ekf2_heading_error", "EKF2's heading"
     yield finding(
         error_if(abs(rotation_deg) >= MIN_SEVERE_HEADING_ERROR_DEG),
         finding_id,
@@ -209,11 +210,14 @@ def detect_uncertain_alignment(analysis: Analysis) -> Findings:
     alignment = analysis.source.alignment
     if alignment is None:
         return
-    for sentence in (*alignment.misplaced, *alignment.warnings):
-        yield finding(
-            error_if(sentence in alignment.misplaced),
-            "position_file_alignment",
-            f"{sentence.rstrip('.')}.",
-            "If time offset, frame and yaw of the file are known, run again with --clock-offset, "
-            "--position-frame and --position-yaw.",
-        )
+    for make_finding, sentences in (
+        (make_error, alignment.misplaced),
+        (make_warning, alignment.warnings),
+    ):
+        for sentence in sentences:
+            yield make_finding(
+                "position_file_alignment",
+                f"{sentence.rstrip('.')}.",
+                "If time offset, frame and yaw of the file are known, run again with "
+                "--clock-offset, --position-frame and --position-yaw.",
+            )

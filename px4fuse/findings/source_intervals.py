@@ -71,6 +71,7 @@ def detect(analysis: Analysis) -> Findings:
 def detect_source_gaps(analysis: Analysis) -> Findings:
     """Detect gaps in the position source."""
     source, whole_flight = analysis.source, analysis.segment.whole_flight
+    # 1. Divide the gaps into those of the log, at start or end of the flight, and in flight
     gaps, gaps_only_in_log = list[Span](), list[Span]()
     invalid_times_s = source.invalid_reasons.index
     for start_s, end_s in analysis.events.gaps:
@@ -85,30 +86,36 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
             gaps.append((start_s, end_s))
         elif end_s - start_s > MIN_GAP_AT_START_OR_END_S:
             yield _make_source_stops_or_begins_finding(analysis, (start_s, end_s), aids)
-    for finding_id, spans in (("source_gap_in_log", gaps_only_in_log), ("source_gap", gaps)):
-        if not spans:
-            continue
-        start_s, end_s = max(spans, key=lambda span: span[1] - span[0])
-        duration_text = f"{end_s - start_s:.1f} s"
-        if len(spans) > 1:
-            duration_text += f", the longest of {len(spans)} gaps"
-        if finding_id == "source_gap":
-            errors_text = describe_errors_after_gap(analysis, (start_s, end_s))
-            message = f"No position for {duration_text}. {errors_text}"
-            action = f"{find_source_texts(analysis).data_link_check} at {start_s:.1f} s."
-        else:
-            message = (
-                f"{source.positions_text} are missing in the log for {duration_text}, but EKF2 "
-                "fused them. KF has no measurement in the gap."
-            )
-            action = _find_action_for_unlogged_positions(analysis, start_s, end_s)
+    # 2. One finding for all gaps of the log, and one for all gaps in flight, on the longest of them
+    if gaps_only_in_log:
+        span_s, duration_text, evidence = _summarise_gaps(gaps_only_in_log)
         yield make_warning(
-            finding_id,
-            message,
-            action,
-            {"count": len(spans), "longest_s": end_s - start_s, "at_s": start_s},
-            tuple(spans),
+            "source_gap_in_log",
+            f"{source.positions_text} are missing in the log for {duration_text}, but EKF2 fused "
+            "them. KF has no measurement in the gap.",
+            _find_action_for_unlogged_positions(analysis, *span_s),
+            evidence,
+            tuple(gaps_only_in_log),
         )
+    if gaps:
+        span_s, duration_text, evidence = _summarise_gaps(gaps)
+        yield make_warning(
+            "source_gap",
+            f"No position for {duration_text}. {describe_errors_after_gap(analysis, span_s)}",
+            f"{find_source_texts(analysis).data_link_check} at {span_s[0]:.1f} s.",
+            evidence,
+            tuple(gaps),
+        )
+
+
+def _summarise_gaps(spans: list[Span]) -> tuple[Span, str, dict[str, float]]:
+    """Return the longest gap, a text with its duration, and evidence of a finding."""
+    start_s, end_s = max(spans, key=lambda span: span[1] - span[0])
+    duration_text = f"{end_s - start_s:.1f} s"
+    if len(spans) > 1:
+        duration_text += f", the longest of {len(spans)} gaps"
+    evidence = {"count": len(spans), "longest_s": end_s - start_s, "at_s": start_s}
+    return (start_s, end_s), duration_text, evidence
 
 
 def _find_action_for_unlogged_positions(analysis: Analysis, start_s: float, end_s: float) -> str:
@@ -132,11 +139,15 @@ def _make_source_stops_or_begins_finding(
         finding_id, event, event_s = "source_begins", "begin", end_s
         before_or_after = "before"
         action = "" if source.alignment else " Take off only when positions arrive."
+    # Example: "UWB positions stop in flight at 60.0 s, 20.0 s before the end of the flight. For
+    # 20.0 s EKF2 relied on the IMU alone (dead reckoning). EKF2's position error at 80.0 s is 4.2
+    # m."
     ekf2_errors_at_end = _find_ekf2_errors_at_end(analysis, span_s)
-    # The error, if known, or else the reported σ
-    for name, quantity in (("sigma_m", "reported σ"), ("error_m", "position error")):
-        if (value_m := ekf2_errors_at_end.get(name)) is not None:
-            effect_sentence = f" EKF2's {quantity} at {end_s:.1f} s is {format_metres(value_m)} m."
+    quantity, value_m = "position error", ekf2_errors_at_end.get("error_m")
+    if value_m is None:
+        quantity, value_m = "reported σ", ekf2_errors_at_end.get("sigma_m")
+    if value_m is not None:
+        effect_sentence = f" EKF2's {quantity} at {end_s:.1f} s is {format_metres(value_m)} m."
     ekf2 = analysis.flight.ekf2
     has_aids = isinstance(ekf2, Ekf2) and bool(ekf2.aids)
     aiding_sentence = ""
@@ -157,31 +168,36 @@ def _make_source_stops_or_begins_finding(
 
 
 def _find_ekf2_errors_at_end(analysis: Analysis, span_s: Span) -> dict[str, float]:
-    """Return EKF2's horizontal position error and reported σ (m) at the end of a time span."""
-    axes, squared_errors_m2 = select_north_and_east(analysis), []
-    for result in axes if len(axes) == 2 else [analysis.main]:
+    """Return EKF2's horizontal position error and reported σ (m) at the end of a time span.
+
+    Unknown values are omitted. Without north and east, the values are along the main axis.
+    """
+    north_and_east = select_north_and_east(analysis)
+    squared_errors_m2, variances_m2 = [], []
+    for result in north_and_east if len(north_and_east) == 2 else [analysis.main]:
         ekf2, truth = result.whole_flight_tracks
         if isinstance(ekf2.state, Unavailable):
             return {}
         position_m = ekf2.state["position_m"].loc[slice(*span_s)]
-        time_s, error_m = position_m.index.to_numpy(), np.full(len(position_m), np.nan)
+        time_s, true_m = position_m.index.to_numpy(), np.full(len(position_m), np.nan)
         if isinstance(truth, pd.DataFrame):
-            true_m = truth["position_m"]
-            error_m = position_m - np.interp(time_s, true_m.index, true_m, np.nan, np.nan)
-        sigma_m = interpolate_sigma(time_s, ekf2.variance, "position_variance_m2")
-        squared_errors_m2.append([error_m**2, sigma_m**2])
-    error_m, sigma_m = np.sqrt(np.sum(squared_errors_m2, axis=0))
-    return {
-        name: float(values[np.isfinite(values)][-1])
-        for name, values in (("error_m", error_m), ("sigma_m", sigma_m))
-        if np.isfinite(values).any()
-    }
+            true_m = np.interp(time_s, truth.index, truth["position_m"], np.nan, np.nan)
+        squared_errors_m2.append((position_m.to_numpy() - true_m) ** 2)
+        variances_m2.append(interpolate_sigma(time_s, ekf2.variance, "position_variance_m2") ** 2)
+    last_values_m = {}
+    for name, squares_m2 in (("error_m", squared_errors_m2), ("sigma_m", variances_m2)):
+        values_m = np.sqrt(np.sum(squares_m2, axis=0))
+        known_values_m = values_m[np.isfinite(values_m)]
+        if len(known_values_m):
+            last_values_m[name] = float(known_values_m[-1])
+    return last_values_m
 
 
 def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
     """Describe the position errors of KF and EKF2 at the end of a gap."""
     result, end_s = analysis.main, gap_span_s[1]
     axis, ekf2, ekf2_state = result.axis, analysis.flight.ekf2, result.ekf2_tracks.state
+    # 1. Reference: ground truth or, without it, the first position after the gap
     if isinstance(result.truth, pd.DataFrame):
         true_m = result.truth["position_m"]
         reference_m = float(np.interp(end_s, true_m.index, true_m))
@@ -206,7 +222,7 @@ def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
             )
             ekf2_text += f" (σ {format_metres(variance_m2**0.5)} m)"
         ekf2_text += ", "
-    # The position at the end of the gap corrects KF: read the state before this update
+    # 3. The position at the end of the gap corrects KF: read the state before this update
     kf_track = predict_track(result.kf_run, np.array([end_s - TIME_BEFORE_UPDATE_S])).iloc[0]
     kf_error_m = abs(kf_track["position_m"] - reference_m)
     kf_sigma_m = kf_track["position_variance_m2"] ** 0.5
@@ -229,6 +245,7 @@ def _find_fused_aids(ekf2: Ekf2 | Unavailable, span_s: Span) -> list[Aid]:
             is_fused = samples["fused"].to_numpy() > 0.0
         elif enabled is not None:
             is_fused = sample_step_function(enabled, samples.index) > 0.0
+        # Fused during the whole span: no pause is as long as half of the span
         times_s = [start_s, *samples.index[is_fused], end_s]
         if np.diff(times_s).max() < 0.5 * (end_s - start_s):
             aids.append(AIDS[name])
@@ -263,29 +280,31 @@ def detect_downsampling(analysis: Analysis) -> Findings:
     """Detect positions that were downsampled before PX4 received them."""
     source = analysis.source
     # This test is valid only if the timestamps are the times at which PX4 received the positions.
-    # EKF2's own copies of the positions, and the origins after them in SOURCE_ORIGINS, have other
-    # timestamps
+    # EKF2's own copies of the positions, and all origins behind them in the order of preference
+    # (copies kept by EKF2, rebuilt from innovations, GNSS), have other timestamps
     if (
         source.clock_map is not None
         or source.origin.find_preference_rank() >= ALIGNED_BY_EKF2_ORIGIN.find_preference_rank()
     ):
         return
     intervals_s, _ = _compute_intervals_s(analysis)
-    if (
-        len(intervals_s) < MIN_INTERVAL_COUNT
-        or (period_and_multiples := _find_period(intervals_s)) is None
-    ):
+    if len(intervals_s) < MIN_INTERVAL_COUNT:
         return
+    period_and_multiples = _find_period(intervals_s)
+    if period_and_multiples is None:
+        return
+    # Period of the source, and number of periods in each interval between received positions
     period_s, multiples = period_and_multiples
     lost_fraction = 1.0 - 1.0 / float(np.mean(multiples))
     # Downsampling to a constant rate makes intervals of n and n + 1 periods. Single lost positions
     # make intervals of many lengths, and a slower source makes one length
     fraction_by_multiple = np.bincount(multiples.astype(np.intp)) / len(multiples)
-    most_frequent_fractions = max(pairwise(fraction_by_multiple), key=sum)
+    # Fractions of intervals of n and of n + 1 periods, for the most frequent pair
+    pair_fractions = max(pairwise(fraction_by_multiple), key=sum)
     if (
         lost_fraction < MIN_MISSING_FRACTION_FOR_DOWNSAMPLING
-        or sum(most_frequent_fractions) < MIN_FRACTION_OF_TWO_MOST_FREQUENT_INTERVALS
-        or min(most_frequent_fractions) < MIN_FRACTION_OF_RARER_INTERVAL_LENGTH
+        or sum(pair_fractions) < MIN_FRACTION_OF_TWO_MOST_FREQUENT_INTERVALS
+        or min(pair_fractions) < MIN_FRACTION_OF_RARER_INTERVAL_LENGTH
     ):
         return
     mean_interval_s = float(np.mean(intervals_s))

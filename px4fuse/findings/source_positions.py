@@ -21,7 +21,7 @@ from px4fuse.filter.hypotheses import (
 )
 from px4fuse.filter.time_offset import SourceTimeOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.finding import Finding
+from px4fuse.finding import Finding, Severity
 from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import (
     Columns,
@@ -141,6 +141,8 @@ def detect(analysis: Analysis) -> Findings:
     yield from detect_repeated_jumps(analysis)
     yield from detect_jumps(analysis)
     yield from detect_outliers(analysis)
+    # Not for odometry (with orientation), whose errors are correlated because of drift, and not for
+    # positions that px4fuse reconstructs from EKF2's data
     if analysis.source.orientation is None and not analysis.source.origin.reconstructed:
         yield from detect_low_pass(analysis)
         yield from detect_scale_error(analysis)
@@ -150,11 +152,13 @@ def detect(analysis: Analysis) -> Findings:
 def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     """Return the low-pass filter of the position source; None if its positions are not filtered."""
     source, low_pass = analysis.source, analysis.source_low_pass
+    time_offset = _find_valid_time_offset(analysis)
+    # The method is not valid for odometry, whose errors are correlated because of drift
+    if source.orientation is not None or source.origin.reconstructed or time_offset is None:
+        return None
+    # A low-pass filter must fit better than white noise, and have a relevant lag
     if (
-        source.orientation is not None  # odometry: its errors are correlated because of drift
-        or source.origin.reconstructed
-        or (time_offset := _find_valid_time_offset(analysis)) is None
-        or isinstance(low_pass, Unavailable)
+        isinstance(low_pass, Unavailable)
         or low_pass.gain_nats < MIN_LOW_PASS_LOG_LIKELIHOOD_RATIO_NATS
         or low_pass.lag_s < MIN_FILTER_LAG_S
     ):
@@ -170,7 +174,8 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     # At a high position rate, the lag estimated from the correlation of the noise is inaccurate:
     # use the measured delay relative to the IMU
     max_delay_s = -time_offset.interval_s[0]  # late timestamps have a negative offset
-    if low_pass.lag_s > MAX_ESTIMATED_LAG_TO_DELAY_RATIO * max_delay_s >= MIN_FILTER_LAG_S:
+    max_lag_s = MAX_ESTIMATED_LAG_TO_DELAY_RATIO * max_delay_s
+    if max_lag_s >= MIN_FILTER_LAG_S and low_pass.lag_s > max_lag_s:
         return replace(low_pass, lag_s=-time_offset.offset_s)
     return low_pass
 
@@ -255,27 +260,26 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
     median_m_by_coordinate = dict(
         zip("xyz", source.samples[Columns.POSITION].median().tolist(), strict=True)
     )
-    finding_id, make_finding = "source_coordinate_constant", make_warning
-    constant_axes_mask, measured_axes_mask = EV_CTRL_HORIZONTAL_MASK, EV_CTRL_HEIGHT_MASK
+    # EKF2 fuses x and y together: if one of them is constant, it must fuse neither
+    finding_id, fused_mask = "source_coordinate_constant", EV_CTRL_HEIGHT_MASK
     if coordinates == ["z"]:
-        finding_id, consequence = "source_height_constant", "The height is not evaluated."
-        constant_axes_mask, measured_axes_mask = EV_CTRL_HEIGHT_MASK, EV_CTRL_HORIZONTAL_MASK
+        finding_id, fused_mask = "source_height_constant", EV_CTRL_HORIZONTAL_MASK
+        make_finding, consequence = make_warning, "The height is not evaluated."
     elif coordinates == ["x", "y"]:
-        consequence = "Only the height is evaluated."
-    else:  # only x, only y, or all three are constant
+        make_finding, consequence = make_warning, "Only the height is evaluated."
+    else:  # only x, only y, or all
         make_finding, consequence = make_error, NO_ESTIMATES_SENTENCE
         if "z" in coordinates:
-            constant_axes_mask |= EV_CTRL_HEIGHT_MASK
-            measured_axes_mask = 0
+            fused_mask = 0
     action, coordinates_text = "", " and ".join(coordinates)
     if EV_POS.switch in parameters:
         value = int(parameters[EV_POS.switch])
-        if value & constant_axes_mask:
-            new_value = value & ~constant_axes_mask | measured_axes_mask
-            action = f"Set {EV_POS.switch} to {new_value}"
+        unfused_mask = (EV_CTRL_HORIZONTAL_MASK | EV_CTRL_HEIGHT_MASK) & ~fused_mask
+        if value & unfused_mask:  # EKF2 fuses a constant coordinate
+            action = f"Set {EV_POS.switch} to {value & ~unfused_mask | fused_mask}"
         else:
             action = f"Leave {EV_POS.switch} at {value}"
-            if coordinates == ["z"]:  # EKF2 does not fuse the constant height
+            if coordinates == ["z"]:
                 make_finding = make_note
         action += f", so that EKF2 does not fuse {coordinates_text}. "
     values_text = ", ".join(f"{median_m_by_coordinate[each]:g}" for each in coordinates)
@@ -346,19 +350,23 @@ def _find_jumps(analysis: Analysis) -> tuple[Array, Array, bool]:
     position_changes_m = np.diff(position_m.to_numpy(), axis=0)
     if len(position_changes_m) < MIN_POSITIONS_FOR_JUMPS:
         return time_s[:0], position_changes_m[:0], False
-    # jump_vectors_m[k] is the change to row k + 2, minus the mean of the changes before and after,
-    # which is the motion of the vehicle
+    # 1. Possible jumps: each position change except the first and the last, minus the mean of the
+    # changes before and after, which is the motion of the vehicle. Possible jump k is the change
+    # from position k + 1 to position k + 2
+    jump_times_s = time_s[2:-1]
     jump_vectors_m = position_changes_m[1:-1] - 0.5 * (
         position_changes_m[:-2] + position_changes_m[2:]
     )
     jump_sizes_m = np.linalg.norm(jump_vectors_m, axis=1)
-    # Jumps that reset_counter announces; a single one is reported by detect_jumps
-    reset_rows = np.searchsorted(time_s, analysis.source.reset_times_s - RESET_TIME_TOLERANCE_S) - 2
-    reset_rows = reset_rows[(reset_rows >= 0) & (reset_rows < len(jump_sizes_m))]
-    reset_rows = reset_rows[jump_sizes_m[reset_rows] >= MIN_JUMP_M]
-    if len(reset_rows) >= MIN_JUMPS_WITH_RESET_COUNTER:
-        return time_s[reset_rows + 2], jump_vectors_m[reset_rows], True
-    # Without reset_counter: jumps much larger than the changes near them
+    # 2. Jumps that reset_counter announces; a single one is reported by detect_jumps
+    reset_jumps = (
+        np.searchsorted(time_s, analysis.source.reset_times_s - RESET_TIME_TOLERANCE_S) - 2
+    )
+    reset_jumps = reset_jumps[(reset_jumps >= 0) & (reset_jumps < len(jump_sizes_m))]
+    reset_jumps = reset_jumps[jump_sizes_m[reset_jumps] >= MIN_JUMP_M]
+    if len(reset_jumps) >= MIN_JUMPS_WITH_RESET_COUNTER:
+        return jump_times_s[reset_jumps], jump_vectors_m[reset_jumps], True
+    # 3. Without reset_counter: jumps much larger than the changes near them
     intervals_s = np.diff(time_s)[1:-1]
     median_interval_s = float(np.median(intervals_s))
     local_median_change_m = (
@@ -371,8 +379,9 @@ def _find_jumps(analysis: Analysis) -> tuple[Array, Array, bool]:
     is_jump = (jump_sizes_m > min_jump_sizes_m) & (
         intervals_s < MAX_JUMP_TO_MEDIAN_INTERVAL_RATIO * median_interval_s
     )
-    # The median position also has to jump, after subtraction of the motion of the vehicle: after an
-    # outlier, it does not
+    # 4. An outlier is no jump: the positions return. The median position of a window after the
+    # jump, minus that of a window before, must equal the jump plus the motion between the window
+    # centres
     window_size = max(MIN_JUMP_DURATION_SAMPLES, round(MIN_JUMP_DURATION_S / median_interval_s))
     for jump in np.flatnonzero(is_jump):
         row = jump + 2  # the first position after the jump
@@ -386,7 +395,7 @@ def _find_jumps(analysis: Analysis) -> tuple[Array, Array, bool]:
             np.linalg.norm(median_shift_m - jump_vectors_m[jump])
             < MAX_MEDIAN_SHIFT_DEVIATION_FRACTION * jump_sizes_m[jump]
         )
-    return time_s[2:-1][is_jump], jump_vectors_m[is_jump], False
+    return jump_times_s[is_jump], jump_vectors_m[is_jump], False
 
 
 def detect_scale_error(analysis: Analysis) -> Findings:
@@ -529,22 +538,26 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
     error_factor = max(variance_ratio, 1.0 / variance_ratio)
     if error_factor < MIN_VARIANCE_ERROR_FACTOR or low <= reported_sigma_m <= high:
         return
+    # A reported σ above the estimated noise may include time-correlated errors, which the estimate
+    # lacks. The errors against ground truth include them: compare the reported σ with these errors
     size_word, correlation_note = "small", ""
     if variance_ratio > 1.0:
         size_word, rmse_m = "large", _compute_rmse_per_axis_m(analysis)
-        # The estimated noise lacks time-correlated errors; the error against ground truth does not
         if rmse_m is None:
             correlation_note = (
                 " The reported σ may include time-correlated errors, which innovations do not show."
             )
         elif reported_sigma_m**2 < MIN_VARIANCE_ERROR_FACTOR * rmse_m**2:
             return
-    severity = error_if(error_factor >= MIN_VARIANCE_ERROR_FACTOR_FOR_SEVERITY_ERROR)
-    cause = REPORTED_VARIANCE_USED_BY_EKF2_CAUSE
-    effect = "EKF2 uses the larger of reported variance and EKF2_EVP_NOISE² (EKF2_EV_NOISE_MD 0)."
     if analysis.flight.log.parameters.get("EKF2_EV_NOISE_MD") == 1:
-        severity, cause = "note", ""
-        effect = "EKF2 ignores reported variances (EKF2_EV_NOISE_MD 1)."
+        severity: Severity = "note"
+        cause, effect = "", "EKF2 ignores reported variances (EKF2_EV_NOISE_MD 1)."
+    else:
+        severity = error_if(error_factor >= MIN_VARIANCE_ERROR_FACTOR_FOR_SEVERITY_ERROR)
+        cause = REPORTED_VARIANCE_USED_BY_EKF2_CAUSE
+        effect = (
+            "EKF2 uses the larger of reported variance and EKF2_EVP_NOISE² (EKF2_EV_NOISE_MD 0)."
+        )
     yield finding(
         severity,
         "source_reported_variance_wrong",

@@ -222,11 +222,13 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
     position_age_s = _find_position_age_s(analysis)
     if position_age_s is None or find_timesync_convergence(analysis) is not None:
         return
+    # Median latency in the first and in the last tenth of the flight
     sample_count = max(MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC, len(position_age_s) // 10)
     initial_latency_s, final_latency_s = (
         float(age_s.median())
         for age_s in (position_age_s.iloc[:sample_count], position_age_s.iloc[-sample_count:])
     )
+    # EKF2 drops positions that are older than its buffer when they arrive
     ekf2, late_drop_sentence, dropped_fraction = analysis.flight.ekf2, "", 0.0
     if isinstance(ekf2, Ekf2) and isinstance(ekf2.horizon_s, float):
         delay_s = 1e-3 * analysis.flight.log.parameters.get(EV_POS.delay, 0.0)
@@ -242,24 +244,24 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
         and rank_correlation(position_age_s.index.to_numpy(), position_age_s.to_numpy())
         >= MIN_CORRELATION_OF_LATENCY_WITH_TIME
     ):
-        change_verb = "grows"
+        change_verb, low_latency_s, high_latency_s = "grows", initial_latency_s, final_latency_s
     # If EKF2 drops nearly all positions, the latency is constant and too long, but does not vary
     elif is_any_dropped and dropped_fraction < 1.0 - MIN_DROPPED_POSITION_FRACTION:
         change_verb = "varies"
-        initial_latency_s, final_latency_s = position_age_s.quantile([0.05, 0.95]).tolist()
+        low_latency_s, high_latency_s = position_age_s.quantile([0.05, 0.95]).tolist()
     else:
         return
     yield finding(
         error_if(is_any_dropped),
         "source_latency_varies",
         f"The latency of the {analysis.source.positions_text} {change_verb} in flight from "
-        f"{initial_latency_s:.2f} s to {final_latency_s:.2f} s (time from measurement to arrival)."
+        f"{low_latency_s:.2f} s to {high_latency_s:.2f} s (time from measurement to arrival)."
         f"{late_drop_sentence}",
         "Find the queue that fills up: sender, bridge or link. Send fewer or smaller messages, and "
         "let the sender drop old positions.",
         {
-            "start_s": initial_latency_s,
-            "end_s": final_latency_s,
+            "start_s": low_latency_s,
+            "end_s": high_latency_s,
             "dropped_fraction": dropped_fraction,
         },
     )

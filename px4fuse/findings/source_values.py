@@ -16,9 +16,10 @@ from px4fuse.convention.lever_arm import (
     estimate_lever_arm,
     find_imu_position_m,
 )
+from px4fuse.core.arrays import rms
 from px4fuse.core.text import format_metres
 from px4fuse.ekf2.model import misalign_positions, replay_with_settings
-from px4fuse.ekf2.replay import rows_inside
+from px4fuse.ekf2.replay import Ekf2Replay, rows_inside
 from px4fuse.finding import format_spans
 from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
@@ -101,8 +102,10 @@ def detect_invalid_positions(analysis: Analysis) -> Findings:
         time_s = invalid_reasons.index[invalid_reasons == reason].to_series()
         if time_s.empty:
             continue
-        # Invalid positions without a valid position between them form one time span
-        times_by_span = time_s.groupby(np.searchsorted(source.samples.index, time_s))
+        # Invalid positions without a valid position between them form one time span: they have the
+        # same number of earlier valid positions
+        valid_counts = np.searchsorted(source.samples.index, time_s)
+        times_by_span = time_s.groupby(valid_counts)
         spans = tuple(zip(times_by_span.min().tolist(), times_by_span.max().tolist(), strict=True))
         start_s, end_s = max(spans, key=lambda span: span[1] - span[0])
         total_s = sum(end - start for start, end in spans)
@@ -111,13 +114,13 @@ def detect_invalid_positions(analysis: Analysis) -> Findings:
         make_finding = make_note if reason == "NaN" and not is_long else make_warning
         error_text = ""
         if is_long:
-            # Last valid position before the time span of invalid positions, and first valid
-            # position after it
+            # Gap in KF's positions: last position before the span, and first position after it. At
+            # the start or end of the flight, use the first or last interval between positions
             valid_times_s = analysis.input_axes[0].measurement_time_s
-            first_row, last_row = np.clip(
+            start_row, end_row = np.clip(
                 np.searchsorted(valid_times_s, (start_s, end_s)), 1, len(valid_times_s) - 1
             )
-            gap_span_s = float(valid_times_s[first_row - 1]), float(valid_times_s[last_row])
+            gap_span_s = float(valid_times_s[start_row - 1]), float(valid_times_s[end_row])
             error_text = f" {describe_errors_after_gap(analysis, gap_span_s)}"
         yield make_finding(
             name,
@@ -163,15 +166,17 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     lever_arm = estimate_lever_arm(analysis.flight, source)
     if lever_arm is None:
         return
+    # Forward and right (m): error of the lever arm from IMU to sensor. Either the parameters of the
+    # sensor position are wrong, or those of the IMU position
     imu_position_m, arm_m = find_imu_position_m(analysis.flight), np.array(lever_arm[:2])
-    # Forward and right: error of the lever arm, correct position of the sensor, and correct
-    # position of the IMU if the sensor's is right. + 0.0 replaces -0.0 by 0.0
-    (forward_m, right_m), sensor_arm_m, imu_arm_m = (
-        (position_m.round(2) + 0.0).tolist()
-        for position_m in (arm_m, source.lever_arm_m[:2] + arm_m, imu_position_m[:2] - arm_m)
+    sensor_change, imu_change = (
+        # + 0.0 replaces -0.0 by 0.0. The parameters for down are not changed
+        dict(zip(names[:2], (position_m.round(2) + 0.0).tolist(), strict=True))
+        for names, position_m in (
+            (find_aid(analysis).lever_arm, source.lever_arm_m[:2] + arm_m),
+            (IMU_POSITION_PARAMETERS, imu_position_m[:2] - arm_m),
+        )
     )
-    change = dict(zip(find_aid(analysis).lever_arm, sensor_arm_m, strict=False))
-    imu_position_change = dict(zip(IMU_POSITION_PARAMETERS, imu_arm_m, strict=False))
     rotation_deg = (
         lever_arm.rotation_deg
         + find_convention_faults(convention, analysis.flight, source.frame).rotation_deg
@@ -180,24 +185,24 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
         MIN_ROTATION_DEG, MIN_ROTATION_SIGMAS * lever_arm.rotation_sigma_deg
     ):
         rotation_deg = 0.0
-    # Either the position of the sensor or that of the IMU is wrong in the parameters. If EKF2 can
-    # be replayed, replays with a corrected position decide which of them is wrong
-    effect_sentence = _describe_replayed_effect(analysis, change, rotation_deg)
+    # If replays are possible, they decide which of the two changes is right
+    effect_sentence = _describe_replayed_effect(analysis, sensor_change, rotation_deg)
     if effect_sentence is not None:
         sensor_text, error_text = f"{source.kind_name} sensor", "the position error"
-        action = f"Set {format_changes(change)}."
+        action = f"Set {format_changes(sensor_change)}."
         if any(imu_position_m) and not has_truth:
             action += (
                 " If the sensor position parameters are right, the IMU position is wrong: set "
-                f"{format_changes(imu_position_change)} instead."
+                f"{format_changes(imu_change)} instead."
             )
     else:
-        effect_sentence = _describe_replayed_effect(analysis, imu_position_change, rotation_deg)
+        effect_sentence = _describe_replayed_effect(analysis, imu_change, rotation_deg)
         if effect_sentence is None:
             return
         sensor_text, error_text = "IMU", "EKF2's position error"
-        action = f"Set {format_changes(imu_position_change)}."
-        forward_m, right_m = 0.0 - forward_m, 0.0 - right_m
+        action = f"Set {format_changes(imu_change)}."
+        arm_m = -arm_m
+    forward_m, right_m = (arm_m.round(2) + 0.0).tolist()
     if source.alignment is not None:  # no EKF2 parameter corrects positions of a file
         sensor_text = "sensor"
         action = "Subtract this lever arm, rotated to NED by the attitude, from the positions."
@@ -221,7 +226,7 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
 def _describe_replayed_effect(
     analysis: Analysis, change: Mapping[str, float], rotation_deg: float = 0.0
 ) -> str | None:
-    """Describe EKF2's position RMSE in replays without and with a change of parameters.
+    """Describe EKF2's position RMSE in replays without and with a change of a lever arm.
 
     ``rotation_deg`` is the detected rotation error of the positions (clockwise from above). Both
     replays use corrected positions, rotated by -``rotation_deg``. Return "" if no replay or ground
@@ -235,30 +240,35 @@ def _describe_replayed_effect(
         or not is_source_fused(analysis, ekf2_model.inputs)
     ):
         return ""
-    rmses_m, ekf2_model = [], misalign_positions(ekf2_model, -rotation_deg, 0.0)
-    changed_model = ekf2_model
+    # The baseline replay already exists for positions that are not rotated
+    baseline_replay = ekf2_model.baseline_replay
+    if rotation_deg:
+        ekf2_model = misalign_positions(ekf2_model, -rotation_deg, 0.0)
+        (baseline_replay,) = replay_with_settings(ekf2_model, [{}])
     # The EKF2 model does not read the position of the IMU from the parameters: change its inputs
     if change.keys() <= {*IMU_POSITION_PARAMETERS}:
-        inputs = ekf2_model.inputs
-        imu_offset_m = np.array([*change.values(), inputs.imu_offset_m[2]])
-        inputs = replace(inputs, imu_offset_m=imu_offset_m)
-        changed_model, change = replace(ekf2_model, inputs=inputs, runs=()), {}
-    replays = replay_with_settings(changed_model, [change])
-    baseline_replays = (
-        replay_with_settings(ekf2_model, [{}]) if rotation_deg else (ekf2_model.baseline_replay,)
+        imu_offset_m = np.array([*change.values(), ekf2_model.inputs.imu_offset_m[2]])
+        inputs = replace(ekf2_model.inputs, imu_offset_m=imu_offset_m)
+        ekf2_model, change = replace(ekf2_model, inputs=inputs, runs=()), {}
+    (changed_replay,) = replay_with_settings(ekf2_model, [change])
+    before_m, after_m = (
+        _compute_horizontal_rmse_m(replay, truth) for replay in (baseline_replay, changed_replay)
     )
-    for replay in (*baseline_replays, *replays):
-        replayed_track = rows_inside(replay.published_state, replay.find_evaluated_spans())
-        axis_errors_m = [
-            replayed_track[name]
-            - np.interp(replayed_track.index, truth.samples.index, truth.samples[name])
-            for name in Columns.POSITION[:2]
-        ]
-        rmses_m.append(float(np.sqrt(np.mean(np.square(np.hypot(*axis_errors_m))))))
-    if rmses_m[1] > MAX_RMSE_RATIO_WITH_TO_WITHOUT_LEVER_ARM * rmses_m[0]:
+    if after_m > MAX_RMSE_RATIO_WITH_TO_WITHOUT_LEVER_ARM * before_m:
         return None
-    rmse_text = " m → ".join(map(format_metres, rmses_m))
-    return f"Replay of EKF2 with this lever arm: horizontal position RMSE {rmse_text} m. "
+    return (
+        "Replay of EKF2 with this lever arm: horizontal position RMSE "
+        f"{format_metres(before_m)} m → {format_metres(after_m)} m. "
+    )
+
+
+def _compute_horizontal_rmse_m(replay: Ekf2Replay, truth: Truth) -> float:
+    track = rows_inside(replay.published_state, replay.find_evaluated_spans())
+    errors_m = (
+        track[name] - np.interp(track.index, truth.samples.index, truth.samples[name])
+        for name in Columns.POSITION[:2]
+    )
+    return rms(np.hypot(*errors_m))
 
 
 def detect_two_senders(analysis: Analysis) -> Findings:
