@@ -88,7 +88,7 @@ def remove_origin_resets(
         texts.append(f"{len(resets)} of {label}")
     treatments = {
         "removed from EKF2's track: the resets only move the origin of EKF2's frame": removed_texts,
-        "kept: the resets correct an error of EKF2": kept_texts,
+        "kept in EKF2's track: the resets correct an error of EKF2": kept_texts,
     }
     statements = (
         f"Jumps by EKF2 resets ({', '.join(texts)}) are {treatment}"
