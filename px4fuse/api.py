@@ -59,7 +59,7 @@ def compare(
     end_s: float | None = None,
     position_source: str | None = None,
     source_kind: request.SourceKind | None = None,
-    height: request.HeightName | None = None,
+    height: request.HeightSensor | None = None,
     position: Pathlike | request.PositionFile | None = None,
     system: int | None = None,
     progress: Progress = lambda _: None,

@@ -25,7 +25,7 @@ SourceKind = Literal["uwb", "vio", "mocap", "gnss"]
 # Directions of x, y and z in a position file, such as east, up and south
 PositionFrame = Literal["ned", "enu", "nwu", "eus", "edn"]
 # Height source of a flight with GNSS
-HeightName = Literal["gnss", "barometer"]
+HeightSensor = Literal["gnss", "barometer"]
 # Coordinate frame of a trajectory file
 FrameName = Literal["NED", "FRD", "ENU", "camera"]
 SystemId = Annotated[int, msgspec.Meta(ge=0, le=255)]
@@ -90,7 +90,7 @@ class ComparisonRequest(
     position: PositionFile | None = None
     position_source: str | None = None
     source_kind: SourceKind | None = None
-    height: HeightName | None = None
+    height: HeightSensor | None = None
     sigma_a_m_s2: float = SIGMA_A_M_S2
     sigma_z_m: float | None = None
     dt_s: float = DT_S

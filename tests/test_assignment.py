@@ -215,7 +215,7 @@ def test_each_fault_in_assignment_log_is_detected_by_analysis(
     log, answer = assignment.simulate_assigned_flight(SECRET, CLASS[number], kind, count, True)
     path = tmp_path / answer.file
     path.write_bytes(log)
-    monkeypatch.setattr(ulog_topics, "ASSIGNMENT_FLAG_KEY", "no such key")
+    monkeypatch.setattr(ulog_topics, "ULOG_ASSIGNMENT_KEY", "no such key")
     flight = px4fuse.read_log(path)
     assert flight.log.sha256 == answer.sha256
     if kind == "loop":

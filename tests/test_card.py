@@ -88,7 +88,7 @@ def test_diagnosis_lists_sensor_fault_before_wrong_parameter() -> None:
         ("source_time_offset", 1), ("sigma_z_too_small", 1),
     ]  # fmt: skip
     # the setting reduces the error more, but a source fault comes first
-    assert ranked[1].log_sigma_ratio_reduction > ranked[0].log_sigma_ratio_reduction
+    assert ranked[1].ln_sigma_ratio_reduction > ranked[0].ln_sigma_ratio_reduction
 
 
 @pytest.mark.parametrize(

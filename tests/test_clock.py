@@ -31,7 +31,7 @@ from scipy.stats import binom, chi2, ttest_ind
 
 from px4fuse.comparison import estimates
 from px4fuse.comparison.estimates import (
-    MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE,
+    MIN_OFFSETS_BEFORE_AND_AFTER_CHANGE,
     estimate_noises_and_time_offset,
     widen_for_scatter,
 )
@@ -158,7 +158,7 @@ def test_imu_motion_at_constant_acceleration_equals_closed_form() -> None:
     )
     measured = np.column_stack([stamps, np.full(len(stamps), np.nan)])
     measured[:5, 0] = np.nan
-    moved = compute_imu_motion(flight, stamps, measured, directions=np.eye(3)[:2], dt_s=DT)
+    moved = compute_imu_motion(flight, stamps, measured, axis_directions=np.eye(3)[:2], dt_s=DT)
     assert len(moved.segment_motions) == 3
     assert moved.time_s[[0, -1]] == pytest.approx([0.75, 79.25])
     positions = moved.make_positions_and_increments(np.array([-0.3, 0.0, 0.21]))
@@ -477,8 +477,8 @@ def test_time_offset_jump_p_value_equals_bonferroni_t_test() -> None:
     offset = np.array([0.0, 0.03, -0.02, 0.01, 0.2, 0.24, 0.19, 0.22, 0.2])
     weight = np.full(len(offset), 1e6)
     places = range(
-        MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE,
-        len(offset) - MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE + 1,
+        MIN_OFFSETS_BEFORE_AND_AFTER_CHANGE,
+        len(offset) - MIN_OFFSETS_BEFORE_AND_AFTER_CHANGE + 1,
     )
     smallest_p = min(ttest_ind(offset[:at], offset[at:]).pvalue for at in places)
     assert estimates._compute_change_p_value(offset, weight) == pytest.approx(

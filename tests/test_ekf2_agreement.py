@@ -42,15 +42,19 @@ def test_ekf2_replay_updates_are_matched_by_measurement_time():
     """An older topic has no measurement time, and repeats the last fusion for 0.5 s."""
     times = np.array([0.9, 0.9941, 1.0, 1.1059, 1.1061, 1.2, 1.3])
     found = match_updates(
-        replayed([9.0, 9.0, 9.0], [1.0, 1.1, 1.2]), times, has_measurement_times=True
+        replayed([9.0, 9.0, 9.0], [1.0, 1.1, 1.2]), times, has_logged_measurement_times=True
     )
     assert found.tolist() == [-1, 0, 0, 1, -1, 2, -1]
     times = np.array([0.9998, 0.99995, 1.0, 1.5, 1.5001, 2.0, 2.4])
-    found = match_updates(replayed([1.0, 2.0], [0.8, 1.8]), times, has_measurement_times=False)
+    found = match_updates(
+        replayed([1.0, 2.0], [0.8, 1.8]), times, has_logged_measurement_times=False
+    )
     assert found.tolist() == [-1, 0, 0, 0, -1, 1, 1]
     # a row within 2 ms of a fusion may still contain the previous innovation
     times = np.array([1.001, 1.003, 1.2, 2.0019, 2.0021])
-    found = match_updates(replayed([1.0, 2.0], [0.8, 1.8]), times, has_measurement_times=False)
+    found = match_updates(
+        replayed([1.0, 2.0], [0.8, 1.8]), times, has_logged_measurement_times=False
+    )
     assert found.tolist() == [-1, 0, 0, -1, 1]
 
 

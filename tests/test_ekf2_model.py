@@ -118,7 +118,7 @@ def test_ekf2_model_of_sample_flight_agrees_with_log(model: Ekf2Model) -> None:
 def test_ekf2_replay_memory_does_not_grow_with_setting_count(
     model: Ekf2Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("px4fuse.ekf2.model.REPLAY_BATCH_SIZE", 2)
+    monkeypatch.setattr("px4fuse.ekf2.model.CONFIGURATIONS_PER_BATCH", 2)
 
     def peak(count: int) -> int:
         tracemalloc.start()

@@ -19,16 +19,16 @@ from px4fuse.ekf2.model import Ekf2Model
 from px4fuse.ekf2.replay import Ekf2Replay, compute_rmse_to_truth, interpolate_component
 from px4fuse.ekf2.replay_segments import ReplaySegment, SensorSamples
 from px4fuse.ekf2.steps import (
-    ATTITUDE_REPLACEMENT_NAME,
-    FLOW_REPLACEMENT_NAME,
-    GNSS_VELOCITY_REPLACEMENT_NAME,
-    MAGNETOMETER_REPLACEMENT_NAME,
-    OUTPUT_PREDICTOR_REPLACEMENT_NAME,
-    REJECTION_REPLACEMENT_NAME,
+    ATTITUDE_PROPERTY_NAME,
+    FLOW_PROPERTY_NAME,
+    GNSS_VELOCITY_PROPERTY_NAME,
+    MAGNETOMETER_PROPERTY_NAME,
+    OUTPUT_PREDICTOR_PROPERTY_NAME,
+    REJECTION_PROPERTY_NAME,
     DifferenceExplanation,
     _find_longest_rejection,
     explain_difference_by_replacements,
-    make_replacement_configurations,
+    make_stepwise_configurations,
 )
 from px4fuse.ekf2.whatif import (
     AxisStatistics,
@@ -99,7 +99,7 @@ def test_parts_of_kf_ekf2_position_difference_add_up_to_total(model):
         largest = sorted(axis.steps, key=lambda step: -step.position_mean_square_m2)[:2]
         assert {step.name for step in largest} == {
             "process noise",
-            OUTPUT_PREDICTOR_REPLACEMENT_NAME,
+            OUTPUT_PREDICTOR_PROPERTY_NAME,
         }
         last = axis.steps[-1].position_rmse_to_truth_m
         assert last == pytest.approx(axis.position_rmse_to_truth_m["ekf2"], abs=0.003)
@@ -125,7 +125,7 @@ def test_each_step_from_kf_to_ekf2_replaces_one_filter_property():
         ReplayInputs, settings=flown, mean_step_s=0.01, received_positions=received, segments=plain
     )
     kf_settings = Settings(0.5, 0.2, 0.16, clock_offset_s=-0.05)
-    found = list(make_replacement_configurations(flight, kf_settings).values())
+    found = list(make_stepwise_configurations(flight, kf_settings).values())
     settings = [configuration.settings for configuration in found]
     assert [s["EKF2_ACC_NOISE"] for s in settings] == pytest.approx([2.0] * 4 + [0.35] * 3)
     assert [s["EKF2_EVP_NOISE"] for s in settings] == [0.2] * 2 + [0.3] * 5
@@ -146,7 +146,7 @@ def test_each_step_from_kf_to_ekf2_replaces_one_filter_property():
         settings={"EKF2_ACC_NOISE": 0.35, "EKF2_GPS_P_NOISE": 0.5, "EKF2_GPS_DELAY": 110.0},
         segments=plain,
     )
-    found = list(make_replacement_configurations(gnss, kf_settings).values())
+    found = list(make_stepwise_configurations(gnss, kf_settings).values())
     assert [configuration.fuses_velocity for configuration in found] == [False] * 6 + [True] * 2
     assert [configuration.has_gate for configuration in found] == [False] * 7 + [True]
     # the GNSS positions of KF already include the delay
@@ -156,15 +156,15 @@ def test_each_step_from_kf_to_ekf2_replaces_one_filter_property():
     ] * 6
     flow = (made(ReplaySegment, flow=made(SensorSamples), height_samples=None),)
     more = {"segments": flow, "settings": gnss.settings | {"EKF2_MAG_NOISE": 0.05}}
-    configurations = make_replacement_configurations(
+    configurations = make_stepwise_configurations(
         made(ReplayInputs, **{**vars(gnss), **more}), kf_settings
     )
     assert list(configurations)[-5:] == [
-        ATTITUDE_REPLACEMENT_NAME,
-        MAGNETOMETER_REPLACEMENT_NAME,
-        GNSS_VELOCITY_REPLACEMENT_NAME,
-        FLOW_REPLACEMENT_NAME,
-        REJECTION_REPLACEMENT_NAME,
+        ATTITUDE_PROPERTY_NAME,
+        MAGNETOMETER_PROPERTY_NAME,
+        GNSS_VELOCITY_PROPERTY_NAME,
+        FLOW_PROPERTY_NAME,
+        REJECTION_PROPERTY_NAME,
     ]
     assert ["mag" in each.disable_time_s_by_aid for each in configurations.values()] == [
         True

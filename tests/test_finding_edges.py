@@ -662,8 +662,8 @@ def slow(gain: float, lag: float, slow_m: float = 0.1) -> TimeCorrelatedNoise:
         np.inf,
         slow_m=slow_m,
         white_m=0.1,
-        gain_nats=gain,
-        low_pass_gain_nats=lag,
+        likelihood_gain_nats=gain,
+        low_pass_likelihood_gain_nats=lag,
     )
 
 

@@ -216,7 +216,7 @@ def test_kf_prediction_formulas_equal_matrix_products(dt: float) -> None:
     np.testing.assert_allclose(model.propagate_state(1.5, -2.0, 3.0, dt), moved[:, 0], rtol=1e-14)
     # Q = B Bᵀ / dt: the acceleration is constant over the step
     np.testing.assert_allclose(
-        model.make_symmetric_matrix(model.compute_process_noise_per_density(dt)),
+        model.make_symmetric_matrix(model.compute_unit_density_process_noise(dt)),
         b @ b.T / dt,
         rtol=1e-14,
     )
@@ -229,9 +229,9 @@ def test_kf_process_noise_sum_of_short_steps_equals_closed_form() -> None:
     for _ in range(count):
         propagate_covariance, added = (
             model.propagate_covariance(covariance, dt),
-            model.compute_process_noise_per_density(dt),
+            model.compute_unit_density_process_noise(dt),
         )
         covariance = tuple(a + b for a, b in zip(propagate_covariance, added, strict=True))
     np.testing.assert_allclose(
-        covariance, model.compute_continuous_process_noise_per_density(total), rtol=1e-7
+        covariance, model.compute_continuous_unit_density_process_noise(total), rtol=1e-7
     )

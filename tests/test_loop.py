@@ -360,7 +360,9 @@ def test_odometry_that_stops_in_flight_gets_no_loop_closure(sample: LoopSource) 
     assert isinstance(loop.true_end, Unavailable)
     assert (loop.closure_error_m, loop.closures) == (None, ())
     chosen = LoopRequest(source="", start_s=start_s, end_s=landing_s - 11.0)
-    assert analyse(replace(sample, flight=flight, trajectory=early), chosen).is_end_assumed
+    assert analyse(
+        replace(sample, flight=flight, trajectory=early), chosen
+    ).is_landing_place_assumed
 
 
 def test_odometry_edge_variance_is_increase_of_logged_variance() -> None:

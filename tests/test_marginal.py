@@ -42,7 +42,7 @@ from px4fuse.filter.marginal_likelihood import (
     fit_positions,
     subtract_smooth_path,
 )
-from px4fuse.filter.model import compute_continuous_process_noise_per_density
+from px4fuse.filter.model import compute_continuous_unit_density_process_noise
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 
@@ -65,7 +65,9 @@ def test_banded_solver_equals_dense_normal_equations(seed: int) -> None:
     second = int(rng.integers(3, count - 2))
     joined = np.arange(1, count) != second
     length = rng.uniform(0.05, 0.6, count - 1)
-    noise = rng.uniform(0.001, 0.4) * np.stack(compute_continuous_process_noise_per_density(length))
+    noise = rng.uniform(0.001, 0.4) * np.stack(
+        compute_continuous_unit_density_process_noise(length)
+    )
     noise[[0, 2]] += rng.choice([0.0, 0.003], count - 1)
     precision = np.stack([rng.uniform(1.0, 100.0, count), np.zeros(count)], 1)
     precision[[0, second], 1] = 0.5, 2.0
@@ -148,7 +150,7 @@ def with_constants(offsets: int = 3) -> PositionsAndIncrements:
     return PositionsAndIncrements(
         measurement_m=measured, segment_start_indices=START, interval_s=length,
         process_noise_per_sigma_a_squared=0.1
-        * np.stack(compute_continuous_process_noise_per_density(length)),
+        * np.stack(compute_continuous_unit_density_process_noise(length)),
         process_noise_independent_of_sigma_a=np.outer(
             [0.3, 0.0, 0.2], rng.choice([0.0, 0.01], COUNT - 1)
         ),

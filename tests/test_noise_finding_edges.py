@@ -537,7 +537,9 @@ def loop(*closures: LoopClosure, **parts: Any) -> Loop:
 def test_loop_closure_with_small_gnc_weight_is_reported(
     closures: tuple[LoopClosure, ...], expected: list[str]
 ) -> None:
-    found = list(loops.detect_inconsistent_closures(loop(*closures, is_end_assumed=False)))
+    found = list(
+        loops.detect_inconsistent_closures(loop(*closures, is_landing_place_assumed=False))
+    )
     assert [finding.id for finding in found] == expected
     if expected == ["loop_drift_too_small"]:
         dropped = sum((each.weight_gnc or 0.0) < 0.5 for each in closures)

@@ -18,7 +18,7 @@ from px4fuse.classroom.assignment.roster import (
     read_roster,
 )
 from px4fuse.classroom.grading.entries import Course
-from px4fuse.classroom.grading.model import ExportOrigin
+from px4fuse.classroom.grading.model import SubmissionOrigin
 from px4fuse.classroom.grading.outputs import fill_grades, find_grade_column
 from px4fuse.classroom.grading.rubric import read_rubric
 from px4fuse.errors import SettingsError
@@ -151,10 +151,10 @@ CLASS = ClassList(
 )  # fmt: skip
 
 
-def at(platform: str, number: str = "", name: str = "", **more: str) -> ExportOrigin:
+def at(platform: str, number: str = "", name: str = "", **more: str) -> SubmissionOrigin:
     """Make the origin of a file: platform and number of the student there."""
     person = Person(more.pop("student_id", ""), name, numbers={platform: number}, **more)
-    return ExportOrigin(platform, person)
+    return SubmissionOrigin(platform, person)
 
 
 @pytest.mark.parametrize(

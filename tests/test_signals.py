@@ -20,7 +20,7 @@ from px4fuse.filter.signals import (
     Segment,
     compute_mean_step_acceleration,
     compute_ned_acceleration,
-    estimate_aisle_heading,
+    estimate_main_heading,
     integrate_ned_acceleration,
     make_axes,
 )
@@ -180,7 +180,7 @@ def line_track(heading_deg, count=200, noise=0.0):
 
 @pytest.mark.parametrize("heading_deg", [0.0, 30.0, 90.0, 135.0, 179.0, 210.0])
 def test_main_axis_of_straight_track_equals_track_direction(heading_deg):
-    heading, elongation = estimate_aisle_heading(line_track(heading_deg)[0], ALL)
+    heading, elongation = estimate_main_heading(line_track(heading_deg)[0], ALL)
     assert (heading - heading_deg + 90.0) % 180.0 - 90.0 == pytest.approx(0.0, abs=1e-6)
     assert 0.0 <= heading < 180.0
     assert elongation > 1e6

@@ -600,16 +600,16 @@ def test_fused_vision_is_reported_as_part_of_kf_ekf2_difference() -> None:
     for why in found.values():
         names = [step.name for step in why.steps]
         assert (
-            names.index(steps.GNSS_VELOCITY_REPLACEMENT_NAME)
-            < names.index(steps.VISION_REPLACEMENT_NAME)
-            < names.index(steps.REJECTION_REPLACEMENT_NAME)
+            names.index(steps.GNSS_VELOCITY_PROPERTY_NAME)
+            < names.index(steps.VISION_PROPERTY_NAME)
+            < names.index(steps.REJECTION_PROPERTY_NAME)
         )
         assert why.unexplained_fraction < 0.05
         moved_m = {step.name: step.position_moved_m for step in why.steps}
         assert (
             min(
-                moved_m[steps.GNSS_VELOCITY_REPLACEMENT_NAME],
-                moved_m[steps.VISION_REPLACEMENT_NAME],
+                moved_m[steps.GNSS_VELOCITY_PROPERTY_NAME],
+                moved_m[steps.VISION_PROPERTY_NAME],
             )
             > 0.05
         )

@@ -16,9 +16,9 @@ from px4fuse.comparison.difference_steps import (
     find_corrected_noise_settings,
 )
 from px4fuse.ekf2.steps import (
-    MEASUREMENT_NOISE_REPLACEMENT_NAME,
-    SAMPLE_TIMES_REPLACEMENT_NAME,
-    TIMESTAMPS_REPLACEMENT_NAME,
+    MEASUREMENT_NOISE_PROPERTY_NAME,
+    SAMPLE_TIMES_PROPERTY_NAME,
+    TIMESTAMPS_PROPERTY_NAME,
     DifferenceExplanation,
 )
 from px4fuse.filter.kalman import predict_track
@@ -59,21 +59,21 @@ def test_position_difference_on_report_page_is_kf_minus_ekf2(sample: Analysis) -
 def test_kf_setting_is_a_part_of_kf_ekf2_position_difference(sample: Analysis) -> None:
     plain = of(sample)
     zero = explain_again(sample, Settings(input="zero"))
-    assert zero.steps[0].name == SAMPLE_TIMES_REPLACEMENT_NAME
+    assert zero.steps[0].name == SAMPLE_TIMES_PROPERTY_NAME
     assert zero.steps[0].position_mean_square_m2 > 10 * plain.steps[0].position_mean_square_m2
     assert "KF uses no acceleration (--input zero)" in " ".join(zero.sentences)
     small = explain_again(sample, Settings(sigma_z_m=0.02))
     assert (
         next(
-            step for step in small.steps if step.name == MEASUREMENT_NOISE_REPLACEMENT_NAME
+            step for step in small.steps if step.name == MEASUREMENT_NOISE_PROPERTY_NAME
         ).position_moved_m
         > 0.05
     )
-    assert MEASUREMENT_NOISE_REPLACEMENT_NAME not in {
+    assert MEASUREMENT_NOISE_PROPERTY_NAME not in {
         step.name for step in plain.steps
     }  # equal settings
     late = explain_again(sample, Settings(clock_offset_s=-0.3))
-    assert TIMESTAMPS_REPLACEMENT_NAME in late.sentences[0]
+    assert TIMESTAMPS_PROPERTY_NAME in late.sentences[0]
     assert "300 ms" in late.sentences[0]
     left = pytest.approx(plain.unexplained_mean_square_m2, rel=0.02)
     assert [o.unexplained_mean_square_m2 for o in (zero, small, late)] == [left] * 3

@@ -21,7 +21,7 @@ from px4fuse.classroom.grading.grade import load_or_verify
 from px4fuse.classroom.grading.rubric import read_rubric, score_report
 from px4fuse.core.reading import hash_files
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD
-from px4fuse.readers.ulog_topics import ASSIGNMENT_FLAG_KEY
+from px4fuse.readers.ulog_topics import ULOG_ASSIGNMENT_KEY
 from px4fuse.results.answer_form import CHOICE_LETTERS, format_answer_form
 from px4fuse.results.contract import ComparisonResults, to_json
 from px4fuse.results.reading import read_results
@@ -108,7 +108,7 @@ def test_report_on_log_without_its_assignment_key_is_rejected(
     assigned: Assigned, tmp_path: Path
 ) -> None:
     copy = tmp_path / assigned.log.name
-    key = ASSIGNMENT_FLAG_KEY.encode()
+    key = ULOG_ASSIGNMENT_KEY.encode()
     copy.write_bytes(assigned.log.read_bytes().replace(key, b"x" * len(key)))
     run_checked("compare", copy, "-o", tmp_path / "copy.pdf")
     assert json.loads((tmp_path / "copy.json").read_text(encoding="utf-8"))["findings"]

@@ -204,7 +204,7 @@ def _match_with_reference(
         is_given_yaw_wrong = is_reliable_fit(fit_with_estimated_yaw, reference.name) and (
             fit.concordance_correlation
             < MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference.name]
-            or needs_rotation(fit.horizontal_rms_m, fit_with_estimated_yaw, reference.name)
+            or needs_rotation(fit.horizontal_residual_rms_m, fit_with_estimated_yaw, reference.name)
         )
     return TrackMatch(
         reference,
@@ -217,13 +217,17 @@ def _match_with_reference(
 
 
 def needs_rotation(
-    horizontal_rms_m: float, fit_with_estimated_yaw: TrackFit, reference: str
+    horizontal_residual_rms_m: float, fit_with_estimated_yaw: TrackFit, reference: str
 ) -> bool:
     """Return True if the fit with estimated yaw has a much smaller horizontal residual (m)."""
     return (
-        horizontal_rms_m
-        > MIN_RESIDUAL_RATIO_OF_GIVEN_TO_ESTIMATED_YAW * fit_with_estimated_yaw.horizontal_rms_m
-        and (horizontal_rms_m > MIN_RESIDUAL_OF_MISALIGNED_FRAME_M or reference == IMU_REFERENCE)
+        horizontal_residual_rms_m
+        > MIN_RESIDUAL_RATIO_OF_GIVEN_TO_ESTIMATED_YAW
+        * fit_with_estimated_yaw.horizontal_residual_rms_m
+        and (
+            horizontal_residual_rms_m > MIN_RESIDUAL_OF_MISALIGNED_FRAME_M
+            or reference == IMU_REFERENCE
+        )
     )
 
 
@@ -311,19 +315,21 @@ def _fit_file_in_frame(
     The lag is estimated if the user gave none.
     """
     file_track = convert_to_ned(problem.samples, frame)
-    grid_track = resample_to_grid(remove_spikes(file_track))
+    resampled_track = resample_to_grid(remove_spikes(file_track))
     if reference.name == IMU_REFERENCE:
-        if len(grid_track.time_s) * GRID_STEP_S < MIN_OVERLAP_S:
+        if len(resampled_track.time_s) * GRID_STEP_S < MIN_OVERLAP_S:
             raise NoMatchError(
                 f"the position file is shorter than {MIN_OVERLAP_S:g} s, too short for a "
                 "match with the IMU"
             )
         # make_imu_references applies the band-pass filter twice: to velocity and to position. Apply
         # it twice to the positions of the file, too
-        position_m = apply_band_pass(apply_band_pass(grid_track.position_m))
-        file_track = grid_track = mark_transients(replace(grid_track, position_m=position_m))
+        position_m = apply_band_pass(apply_band_pass(resampled_track.position_m))
+        file_track = resampled_track = mark_transients(
+            replace(resampled_track, position_m=position_m)
+        )
     if problem.lag_s is None:
-        peak = find_correlation_peak(grid_track, reference, yaw_rad)
+        peak = find_correlation_peak(resampled_track, reference, yaw_rad)
     else:
         peak = CorrelationPeak(problem.lag_s)
     return fit_by_least_squares(

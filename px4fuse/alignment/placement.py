@@ -157,15 +157,17 @@ def align_position_file(
         f"{recording.clock_kind} clock"
     )
     # Time (s) from the start of the log to the first position of the file
-    lag_s = None if clock_offset_s is None else start_s + clock_offset_s - boot_time_s
-    if lag_s is not None and not start_s - end_s <= lag_s <= duration_s:
+    file_lag_s = None if clock_offset_s is None else start_s + clock_offset_s - boot_time_s
+    if file_lag_s is not None and not start_s - end_s <= file_lag_s <= duration_s:
         raise MissingDataError(
             f"{name}: with --clock-offset {clock_offset_s:.3f} the file does not "
             f"overlap the log ({spans_text})",
             "Correct or omit --clock-offset.",
         )
     yaw_rad = None if yaw_deg == "auto" else float(np.radians(yaw_deg or 0.0))
-    problem = AlignmentProblem(samples, (frame,) if frame else recording.frames, yaw_rad, lag_s)
+    problem = AlignmentProblem(
+        samples, (frame,) if frame else recording.frames, yaw_rad, file_lag_s
+    )
     try:
         match = find_match(flight, problem)
     except NoMatchError as error:
@@ -297,7 +299,7 @@ def _apply_alignment(
     reference_name = match.reference.name if match else ""
     # Values of the user. Those that the user did not give are replaced by those of the match
     yaw_rad, lag_s, origin_m = problem.yaw_rad or 0.0, problem.lag_s or 0.0, np.zeros(3)
-    yaw_sigma_deg = time_offset_sigma_s = reference_correlation = residual_rms_m = None
+    yaw_sigma_deg = time_offset_sigma_s = correlation_with_reference = residual_rms_m = None
     if match and is_yaw_estimated:
         yaw_rad = match.fit.yaw_rad
         yaw_sigma_deg = float(np.degrees(match.fit.yaw_sigma_rad or 0.0))
@@ -314,7 +316,7 @@ def _apply_alignment(
             f"includes any delay of the {reference_name}"
         )
     if match:
-        reference_correlation = float(
+        correlation_with_reference = float(
             (np.exp(-1j * yaw_rad) * match.time_offset_fit.coherence).real
         )
     aligned_samples = align_samples(problem.samples, frame, yaw_rad, origin_m, lag_s)
@@ -325,7 +327,7 @@ def _apply_alignment(
         ekf2_comparison := _compare_with_ekf2(flight, aligned_samples)
     ):
         reference_name = EKF2_REFERENCE
-        distance_to_ekf2_m, reference_correlation = ekf2_comparison
+        distance_to_ekf2_m, correlation_with_reference = ekf2_comparison
         residual_rms_m = float(np.sqrt(np.mean(distance_to_ekf2_m**2) / 2.0))
     frame_conflicts, warnings = list[str](), list[str]()
     if match:
@@ -336,12 +338,12 @@ def _apply_alignment(
     if (
         distance_to_ekf2_m is not None
         and not (is_yaw_estimated or frame_conflicts)
-        and reference_correlation is not None
-        and reference_correlation < MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[EKF2_REFERENCE]
+        and correlation_with_reference is not None
+        and correlation_with_reference < MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[EKF2_REFERENCE]
     ):
         warnings.append(
             "The position file does not match the EKF2 position (correlation "
-            f"{reference_correlation:.2f}). Check time offset, frame and yaw."
+            f"{correlation_with_reference:.2f}). Check time offset, frame and yaw."
         )
     unix_start_s = flight.log.start_unix_s
     if recording.clock_kind == "UNIX" and unix_start_s is not None and clock_offset_s is not None:
@@ -363,7 +365,7 @@ def _apply_alignment(
         clock_offset_sigma_s=time_offset_sigma_s,
         clock_reason=time_offset_reason,
         reference=reference_name,
-        correlation=reference_correlation,
+        correlation=correlation_with_reference,
         residual_rms_m=residual_rms_m,
         misplaced=tuple(frame_conflicts),
         warnings=tuple(warnings),
@@ -410,7 +412,7 @@ def _find_frame_conflict(
         has_conflict, shift_text = match.is_given_yaw_wrong, ""
     else:
         # The distances contain rotation and shift. Residual per horizontal axis, like
-        # TrackFit.horizontal_rms_m
+        # TrackFit.horizontal_residual_rms_m
         residual_m = compute_clipped_rms_m(distance_to_ekf2_m) / np.sqrt(2.0)
         shift_m = np.hypot(*fit.origin_m[:2])
         has_conflict = (

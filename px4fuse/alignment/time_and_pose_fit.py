@@ -27,7 +27,7 @@ MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH = {EKF2_REFERENCE: 0.7, IMU_REFERENC
 # Lower limit of 1 - c in the match quality -N·ln(1 - c) of N common samples with concordance
 # correlation coefficient c. Without this limit, a lag at which a few samples agree exactly would be
 # the best match
-MIN_CONCORDANCE_DEFICIT = 1e-4
+MIN_ONE_MINUS_CONCORDANCE = 1e-4
 # Lags within this time (s) of the best lag may belong to the same correlation peak
 MIN_PEAK_DISTANCE_S = 3.0
 # Second peak of the correlation over the lag: minimum number of common samples, and minimum sum of
@@ -76,7 +76,7 @@ class TrackFit(CorrelationPeak):
         Position of the file's origin: north, east, down.
     coherence : complex
         Correlation of file and reference; its phase is the yaw.
-    horizontal_rms_m, residual_rms_m : float
+    horizontal_residual_rms_m, residual_rms_m : float
         RMS residual per horizontal axis, and RMS length of the residual.
     """
 
@@ -85,7 +85,7 @@ class TrackFit(CorrelationPeak):
     yaw_sigma_rad: float | None
     origin_m: Array
     coherence: complex
-    horizontal_rms_m: float
+    horizontal_residual_rms_m: float
     residual_rms_m: float
 
 
@@ -131,7 +131,7 @@ def find_correlation_peak(
         2.0 * rotated_covariance, square_sum_m2, out=concordance_correlation, where=has_overlap
     )
     log_likelihood_gain = -common_sample_counts * np.log(
-        np.maximum(1.0 - concordance_correlation, MIN_CONCORDANCE_DEFICIT)
+        np.maximum(1.0 - concordance_correlation, MIN_ONE_MINUS_CONCORDANCE)
     )
     best_index = int(np.argmax(np.where(has_overlap, log_likelihood_gain, -np.inf)))
 
@@ -211,8 +211,11 @@ def fit_by_least_squares(
     # uncorrelated; below, the origin is converted back
     centre_m, reference_mean_m = file_position_m.mean(), reference_position_m.mean()
     file_position_m = file_position_m - centre_m
-    file_variance_m2, reference_variance_m2 = np.var(file_position_m), np.var(reference_position_m)
-    sigma_product_m2 = np.sqrt(file_variance_m2 * reference_variance_m2)
+    file_position_variance_m2, reference_position_variance_m2 = (
+        np.var(file_position_m),
+        np.var(reference_position_m),
+    )
+    sigma_product_m2 = np.sqrt(file_position_variance_m2 * reference_position_variance_m2)
     covariance_m2 = np.vdot(file_position_m, reference_position_m) / len(file_position_m)
     # The coherence is the correlation as a complex number: its phase is the yaw, and its magnitude
     # does not depend on scale. The concordance (below) also decreases with a difference in scale
@@ -264,13 +267,15 @@ def fit_by_least_squares(
     # If the lag is given, there is no correlation peak: compute the concordance at the fitted yaw
     if np.isnan(concordance_correlation):
         rotated_covariance_m2 = (np.exp(-1j * fitted_yaw_rad) * covariance_m2).real
-        mean_of_variances_m2 = max((file_variance_m2 + reference_variance_m2) / 2.0, 1e-300)
+        mean_of_variances_m2 = max(
+            (file_position_variance_m2 + reference_position_variance_m2) / 2.0, 1e-300
+        )
         concordance_correlation = rotated_covariance_m2 / mean_of_variances_m2
     # Position of the file's origin, from that of the centre of its positions
     complex_origin_m = (
         complex(origin_north_m, origin_east_m) - np.exp(1j * fitted_yaw_rad) * centre_m
     )
-    horizontal_rms_m = compute_clipped_rms_m(np.abs(residuals_m)) / np.sqrt(2.0)
+    horizontal_residual_rms_m = compute_clipped_rms_m(np.abs(residuals_m)) / np.sqrt(2.0)
     reference_ned_m, _ = reference.at(reference_time_s + lag_correction_s)
     origin_down_m, vertical_rms_m = _fit_vertical(
         reference_ned_m[:, 2] - file_track.position_m[is_used, 2]
@@ -285,8 +290,8 @@ def fit_by_least_squares(
         yaw_sigma_rad=yaw_sigma_rad if yaw_rad is None else None,
         origin_m=np.array([complex_origin_m.real, complex_origin_m.imag, origin_down_m]),
         coherence=coherence,
-        horizontal_rms_m=horizontal_rms_m,
-        residual_rms_m=np.sqrt(2.0 * horizontal_rms_m**2 + vertical_rms_m**2),
+        horizontal_residual_rms_m=horizontal_residual_rms_m,
+        residual_rms_m=np.sqrt(2.0 * horizontal_residual_rms_m**2 + vertical_rms_m**2),
     )
 
 

@@ -145,11 +145,13 @@ def _smooth_ekf2_track(state: pd.DataFrame) -> SampledTrack:
             f"the log has fewer than {MIN_MATCHED_SAMPLES} horizontal EKF2 positions"
         )
     position_m = finite_state[Columns.POSITION].to_numpy()
-    grid_track = resample_to_grid(_make_gapless_track(finite_state.index.to_numpy(), position_m))
+    resampled_track = resample_to_grid(
+        _make_gapless_track(finite_state.index.to_numpy(), position_m)
+    )
     return replace(
-        grid_track,
+        resampled_track,
         position_m=gaussian_filter1d(
-            grid_track.position_m, SMOOTHING_SIGMA_S / GRID_STEP_S, axis=0, mode="nearest"
+            resampled_track.position_m, SMOOTHING_SIGMA_S / GRID_STEP_S, axis=0, mode="nearest"
         ),
         name=EKF2_REFERENCE,
     )

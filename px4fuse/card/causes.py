@@ -77,13 +77,13 @@ class RankedCause(NamedTuple):
     ----------
     rank : int
         Importance: 0 for the most important causes, 4 for the least important causes.
-    log_sigma_ratio_reduction : float
+    ln_sigma_ratio_reduction : float
         Decrease of |ln(actual σ ÷ reported σ)|, summed over the re-runs.
     """
 
     finding: Finding
     rank: int
-    log_sigma_ratio_reduction: float
+    ln_sigma_ratio_reduction: float
     reruns: tuple[Rerun, ...]
 
 
@@ -102,9 +102,9 @@ def rank_causes(analysis: Analysis, cause_findings: Sequence[Finding]) -> list[R
         # a fault is no cause if all re-runs could show an effect of it, but show none
         elif reruns and all(can_show_effect(rerun) and not has_effect(rerun) for rerun in reruns):
             continue
-        log_sigma_ratio_reduction = sum(map(compute_sigma_ratio_improvement, reruns))
+        ln_sigma_ratio_reduction = sum(map(compute_sigma_ratio_improvement, reruns))
         rank = _find_cause_rank(finding, reruns)
-        ranked_cause = RankedCause(finding, rank, log_sigma_ratio_reduction, reruns)
+        ranked_cause = RankedCause(finding, rank, ln_sigma_ratio_reduction, reruns)
         (repeated_verdicts if is_repeated_verdict else causes).append(ranked_cause)
     return sorted(
         causes or repeated_verdicts,
@@ -112,13 +112,13 @@ def rank_causes(analysis: Analysis, cause_findings: Sequence[Finding]) -> list[R
             cause.rank,
             # faults of the source first: a changed setting may only hide them. This order does not
             # apply to warnings without a helpful re-run (rank 4)
-            cause.rank < 4 and _is_setting_fault(cause.finding),
-            -cause.log_sigma_ratio_reduction,
+            cause.rank < 4 and _is_wrong_setting(cause.finding),
+            -cause.ln_sigma_ratio_reduction,
         ),
     )
 
 
-def _is_setting_fault(finding: Finding) -> bool:
+def _is_wrong_setting(finding: Finding) -> bool:
     rerun_kinds = FINDING_CATALOGUE[finding.id].rerun_kinds
     return bool(rerun_kinds) and rerun_kinds <= SETTING_CHANGE_KINDS
 
@@ -136,7 +136,7 @@ def _find_cause_rank(finding: Finding, reruns: Sequence[Rerun]) -> int:
         return 0
     # A changed setting that leaves a filter overconfident is not the main cause, although its
     # re-run may make another ratio consistent
-    if _is_setting_fault(finding) and any(map(remains_overconfident, reruns)):
+    if _is_wrong_setting(finding) and any(map(remains_overconfident, reruns)):
         return 3
     if any(map(becomes_consistent, reruns)):
         return 1
@@ -237,11 +237,11 @@ def _make_actions(
         # The user corrects either the timestamps or the delay parameter: two alternatives. A
         # parameter that both corrections change (EKF2_DELAY_MAX) is not part of the alternatives,
         # but a further action
-        offset_setting_names = offset_rerun.change.keys() if offset_rerun else ()
+        time_offset_setting_names = offset_rerun.change.keys() if offset_rerun else ()
         delay_parameter_values = {
             name: value
             for name, value in delay_rerun.change.items()
-            if name not in offset_setting_names
+            if name not in time_offset_setting_names
         }
         delay_action = make_parameter_action(analysis, delay_parameter_values)
         if offset_rerun:
@@ -249,7 +249,7 @@ def _make_actions(
         else:
             actions.append(delay_action)
     # If only the settings are wrong, the sender needs no change
-    elif offset_rerun or not (_is_setting_fault(finding) and ranked_cause.reruns):
+    elif offset_rerun or not (_is_wrong_setting(finding) and ranked_cause.reruns):
         actions += sender_actions
     actions += _make_setting_actions(analysis, useful_reruns, request)
     # Actions on the vehicle first, actions on KF last
@@ -278,8 +278,8 @@ def _make_setting_actions(
         elif rerun.kinds != ("defaults",) and change.keys() <= COMPARISON_OPTIONS.keys():
             # --clock-offset replaces the offset from the alignment, so it must include that offset
             if TIME_OFFSET_KEY in change and (alignment := analysis.source.alignment):
-                total_s = change[TIME_OFFSET_KEY] + alignment.clock_offset_s
-                change[TIME_OFFSET_KEY] = round(total_s, 3)
+                total_offset_s = change[TIME_OFFSET_KEY] + alignment.clock_offset_s
+                change[TIME_OFFSET_KEY] = round(total_offset_s, 3)
             command = command_line(structs.replace(request, **change))
             yield Action("KF", "", (command,), "shell")
 
@@ -374,12 +374,12 @@ def _find_action_target(finding: Finding, source: PositionTrack | None = None) -
     # Findings on the source have a remedy for EKF2 if EKF2, not the source, is set wrongly
     is_remedy_about_ekf2_parameter = finding.remedy.startswith(("Set EKF2_", "Check EKF2_"))
     # The same finding covers errors of KF and EKF2: its evidence names the filters
-    is_ekf2_error_only = (
+    is_only_ekf2_overconfident = (
         finding.id == "error_exceeds_reported_sigma"
         and finding.evidence.get("filter") == "ekf2"
         and "kf_sigma_p_m" not in finding.evidence
     )
-    if (target == "sender" and is_remedy_about_ekf2_parameter) or is_ekf2_error_only:
+    if (target == "sender" and is_remedy_about_ekf2_parameter) or is_only_ekf2_overconfident:
         target = "EKF2"
     is_gnss_receiver = target == "sender" and source is not None and source.origin.is_gnss
     return "receiver" if is_gnss_receiver else target

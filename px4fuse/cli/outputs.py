@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from px4fuse.results.contract import Results
 
 # Maximum length (bytes) of a default report name, and length to which a longer name is cut
-MAX_NAME_BYTES, SHORTENED_NAME_BYTES = 200, 180
+MAX_REPORT_NAME_BYTES, SHORTENED_REPORT_NAME_BYTES = 200, 180
 
 # Line width (characters) in a pipe: longer than any paragraph
 LINE_WIDTH_OF_PIPED_OUTPUT = 10_000
@@ -133,8 +133,8 @@ def choose_default_report_path(report_stem: str, results: Results) -> Path:
     from px4fuse.results.reading import read_results
     from px4fuse.verification.pdf_input import read_attached_results
 
-    if len(os.fsencode(report_stem)) > MAX_NAME_BYTES:
-        short_stem = os.fsencode(report_stem)[:SHORTENED_NAME_BYTES].decode(errors="ignore")
+    if len(os.fsencode(report_stem)) > MAX_REPORT_NAME_BYTES:
+        short_stem = os.fsencode(report_stem)[:SHORTENED_REPORT_NAME_BYTES].decode(errors="ignore")
         report_stem = f"{short_stem}_{hashlib.sha256(os.fsencode(report_stem)).hexdigest()[:8]}"
     path = Path("reports", f"{report_stem}.pdf")
     kind = "a report by the same student on the same input files"

@@ -110,7 +110,7 @@ def find_candidate_changes(
         changes.append({ROTATION_KEY: -round(heading.misalignment_deg, 1)})
     if ekf2_inputs is None:
         return changes + _find_bias_changes(estimates)
-    changes += _find_default_changes(comparison.flight.log, ekf2_inputs)
+    changes += _find_changes_to_defaults(comparison.flight.log, ekf2_inputs)
     if axis_tuning is not None and not is_underconfident:
         changes += _find_acc_noise_changes(comparison.settings, ekf2_inputs, axis_tuning)
     return changes
@@ -241,7 +241,7 @@ def _find_ekf2_noise_changes(
     return [change] if change else []
 
 
-def _find_default_changes(log: LogInfo, ekf2_inputs: ReplayInputs) -> list[ChangedValues]:
+def _find_changes_to_defaults(log: LogInfo, ekf2_inputs: ReplayInputs) -> list[ChangedValues]:
     """Return one change to PX4's default for each EKF2 noise that differs from the default."""
     gate_parameter = ekf2_inputs.aid.gate
     changes = list[ChangedValues]()

@@ -189,7 +189,7 @@ def compute_difference_statistics(
     kf_track = predict_track(kf_run, ekf2_state.index.to_numpy())
     kf_minus_ekf2 = (kf_track[STATE_COLUMNS] - ekf2_state[STATE_COLUMNS]).dropna()
     position_m, velocity_m_s = kf_minus_ekf2.to_numpy().T
-    if len(position_m) < projection.MIN_COMMON_SAMPLES:
+    if len(position_m) < projection.MIN_COMPARED_SAMPLES:
         return Unavailable(
             "difference KF - EKF2",
             f"KF and EKF2 have only {len(position_m)} common samples",
@@ -241,7 +241,7 @@ def compute_error_statistics(
         return truth
     position_m, velocity_m_s = (_compute_errors(state, truth, column) for column in STATE_COLUMNS)
     count = int(np.isfinite(position_m).sum())
-    if count < projection.MIN_COMMON_SAMPLES:
+    if count < projection.MIN_COMPARED_SAMPLES:
         return Unavailable(
             "error against ground truth",
             "filter and ground truth do not overlap in time",

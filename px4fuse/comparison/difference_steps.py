@@ -40,7 +40,7 @@ MIN_REPORTED_KF_POSITION_CHANGE_M = 1e-6
 MIN_DIFFERENCE_OUTSIDE_REPLAY_M = 0.5
 # A position difference KF - EKF2 outside the replayed time is reported only if it is larger by this
 # factor than the difference inside the replayed time
-MIN_OUTSIDE_TO_INSIDE_DIFFERENCE_RATIO = 3.0
+MIN_DIFFERENCE_RATIO_OUTSIDE_REPLAY = 3.0
 
 
 def explain_ekf2_difference(
@@ -122,7 +122,7 @@ def list_explanation_configurations(
 ) -> list[FilterConfiguration]:
     """Return the EKF2 configurations whose replays explain the difference KF - EKF2."""
     return list(
-        steps.make_replacement_configurations(
+        steps.make_stepwise_configurations(
             ekf2_inputs, _make_comparable_settings(comparison, ekf2_inputs, estimate_by_setting)
         ).values()
     )
@@ -181,7 +181,7 @@ def add_cause_sentences(
         causes.append(("Second largest", second))
     for rank_text, replacement in causes:
         reason = reason_by_property_name[replacement.name]
-        if replacement.name == steps.REJECTION_REPLACEMENT_NAME:
+        if replacement.name == steps.REJECTION_PROPERTY_NAME:
             reason += _describe_rejections(explanation)
         sentences.append(
             f"{rank_text} contribution to the difference KF - EKF2 along {axis_label}: "
@@ -193,7 +193,7 @@ def add_cause_sentences(
     max_difference_inside_replay_m = np.max(np.abs(explanation.kf_minus_ekf2_m))
     if outside is not None and outside.maximum_m > max(
         MIN_DIFFERENCE_OUTSIDE_REPLAY_M,
-        MIN_OUTSIDE_TO_INSIDE_DIFFERENCE_RATIO * max_difference_inside_replay_m,
+        MIN_DIFFERENCE_RATIO_OUTSIDE_REPLAY * max_difference_inside_replay_m,
     ):
         sentences.append(
             "Outside the replayed times (while EKF2 initialises or does not fuse positions) the "
@@ -233,13 +233,17 @@ def _describe_property_differences(
 ) -> dict[str, str]:
     """Describe how each property of EKF2 that KF can take over differs from that of KF."""
     kf_settings, inputs, source = comparison.settings, model.inputs, comparison.source
-    parameters, aid, ekf2_source = inputs.settings, inputs.aid, inputs.received_positions.source
+    parameters, aid, ekf2_position_source = (
+        inputs.settings,
+        inputs.aid,
+        inputs.received_positions.source,
+    )
     # The first replacement changes all inputs of KF: accelerations, positions and sample times.
     # State the largest of these differences
     if kf_settings.input == "zero":
         sample_time_text = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
-    elif source.name != ekf2_source:
-        sample_time_text = f"KF uses positions of {source.name}; EKF2 uses {ekf2_source}"
+    elif source.name != ekf2_position_source:
+        sample_time_text = f"KF uses positions of {source.name}; EKF2 uses {ekf2_position_source}"
     else:
         sample_time_text = (
             f"KF predicts every {kf_settings.dt_s:g} s, starting at its first position; EKF2 "
@@ -254,13 +258,13 @@ def _describe_property_differences(
     if isinstance(time_offset, SourceTimeOffset) and time_offset.is_determinable:
         low_offset_s, high_offset_s = time_offset.interval_s
         # The largest offset is the smallest age
-        estimated_age_ms, low_ms, high_ms = (
+        estimated_position_age_ms, low_ms, high_ms = (
             1e3 * (source.assumed_delay_s - offset_s)
             for offset_s in (time_offset.offset_s, high_offset_s, low_offset_s)
         )
         delay_text += (
-            f". The maximum-likelihood age is {estimated_age_ms:.0f} ms (95 % {low_ms:.0f} to "
-            f"{high_ms:.0f} ms)"
+            f". The maximum-likelihood age is {estimated_position_age_ms:.0f} ms "
+            f"(95 % {low_ms:.0f} to {high_ms:.0f} ms)"
         )
     # White acceleration noise adds the variance (σ · step)² per step: the same variance per second
     # needs σ in proportion to 1 / √step
@@ -270,38 +274,38 @@ def _describe_property_differences(
         "IMU" if acc_noise_as_sigma_a < kf_settings.sigma_a_m_s2 else "positions"
     )
     return {
-        steps.SAMPLE_TIMES_REPLACEMENT_NAME: sample_time_text,
-        steps.TIMESTAMPS_REPLACEMENT_NAME: delay_text,
-        steps.MEASUREMENT_NOISE_REPLACEMENT_NAME: (
+        steps.SAMPLE_TIMES_PROPERTY_NAME: sample_time_text,
+        steps.TIMESTAMPS_PROPERTY_NAME: delay_text,
+        steps.MEASUREMENT_NOISE_PROPERTY_NAME: (
             f"EKF2 uses a measurement noise of {find_used_noise_m(inputs):.2g} m "
             f"({aid.noise}), KF uses {kf_settings.sigma_z_m:.2g} m"
         ),
-        steps.ACCELEROMETER_BIAS_REPLACEMENT_NAME: (
+        steps.ACCELEROMETER_BIAS_PROPERTY_NAME: (
             "EKF2 estimates the accelerometer bias; KF does not"
         ),
-        steps.PROCESS_NOISE_REPLACEMENT_NAME: (
+        steps.PROCESS_NOISE_PROPERTY_NAME: (
             f"EKF2_ACC_NOISE {acc_noise:g} has the same effect as SIGMA_A "
             f"{acc_noise_as_sigma_a:.2g} m/s²; KF has SIGMA_A {kf_settings.sigma_a_m_s2:.2g} m/s². "
             f"EKF2 gives the {higher_weighted_input} more weight than KF does"
         ),
-        steps.ATTITUDE_REPLACEMENT_NAME: (
+        steps.ATTITUDE_PROPERTY_NAME: (
             "EKF2 corrects its attitude with the positions; KF uses EKF2's logged attitude"
         ),
-        steps.MAGNETOMETER_REPLACEMENT_NAME: (
+        steps.MAGNETOMETER_PROPERTY_NAME: (
             "EKF2 estimates its heading with the magnetometer; KF uses EKF2's published heading"
         ),
-        steps.GNSS_VELOCITY_REPLACEMENT_NAME: (
+        steps.GNSS_VELOCITY_PROPERTY_NAME: (
             "EKF2 also fuses GNSS velocity; KF uses GNSS position only"
         ),
-        steps.FLOW_REPLACEMENT_NAME: "EKF2 also fuses optical flow; KF uses positions only",
-        steps.VISION_REPLACEMENT_NAME: (
+        steps.FLOW_PROPERTY_NAME: "EKF2 also fuses optical flow; KF uses positions only",
+        steps.VISION_PROPERTY_NAME: (
             "EKF2 fuses external vision and GNSS; KF uses one position source"
         ),
-        steps.REJECTION_REPLACEMENT_NAME: (
+        steps.REJECTION_PROPERTY_NAME: (
             f"EKF2 rejects {100 * model.agreement.rejected_fraction_logged:.1f} % of the "
-            f"positions of {ekf2_source}; KF has no innovation gate and uses all positions"
+            f"positions of {ekf2_position_source}; KF has no innovation gate and uses all positions"
         ),
-        steps.OUTPUT_PREDICTOR_REPLACEMENT_NAME: (
+        steps.OUTPUT_PREDICTOR_PROPERTY_NAME: (
             f"EKF2 fuses positions with a delay of {1e3 * inputs.horizon_s:.0f} ms. EKF2's "
             f"output predictor (EKF2_TAU_POS {parameters['EKF2_TAU_POS']:g} s) extrapolates "
             "to the present. KF has no delay"

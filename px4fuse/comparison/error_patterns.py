@@ -29,7 +29,7 @@ MIN_POSITIONS = 100
 # Rows of the four neighbours of a position, relative to the row of the position
 NEIGHBOUR_ROW_OFFSETS = np.array([-2, -1, 1, 2])
 # Maximum time span of the four neighbours of a position ÷ median interval, to exclude gaps
-MAX_NEIGHBOUR_TIME_SPAN_IN_MEDIAN_INTERVALS = 8.0
+MAX_NEIGHBOUR_SPAN_IN_MEDIAN_INTERVALS = 8.0
 # Maximum σ of a residual (position - interpolation) ÷ σ of a position: above this ratio, the
 # interpolation is inaccurate
 MAX_RESIDUAL_TO_POSITION_SIGMA_RATIO = 4.0
@@ -270,7 +270,7 @@ def _compute_interpolation_weights(time_s: Array, interval_s: float) -> tuple[Ar
     rows = np.arange(2, len(time_s) - 2)
     neighbour_rows = rows[:, None] + NEIGHBOUR_ROW_OFFSETS
     elapsed_intervals = (time_s[neighbour_rows] - time_s[rows, None]) / interval_s
-    is_without_gap = np.ptp(elapsed_intervals, axis=1) < MAX_NEIGHBOUR_TIME_SPAN_IN_MEDIAN_INTERVALS
+    is_without_gap = np.ptp(elapsed_intervals, axis=1) < MAX_NEIGHBOUR_SPAN_IN_MEDIAN_INTERVALS
     # powers[row, k, neighbour] = tᵏ, so powers @ w = (1, 0, 0, 0): w is column 0 of the inverse
     powers = elapsed_intervals[is_without_gap, None] ** np.arange(4)[:, None]
     return rows[is_without_gap], np.linalg.inv(powers)[:, :, 0]
@@ -374,8 +374,8 @@ def fit_errors_against_truth(
     time_s, position_m = time_s[is_inside], position_m[is_inside]
     if len(time_s) < MIN_POSITIONS:
         return None
-    true_spline = CubicSpline(true_positions_m.index, true_positions_m)
-    true_m, velocity_m_s = true_spline(time_s), true_spline(time_s, 1)
+    truth_spline = CubicSpline(true_positions_m.index, true_positions_m)
+    true_m, velocity_m_s = truth_spline(time_s), truth_spline(time_s, 1)
     path_m = true_m - true_m.mean(axis=0)
     path_mean_square_m2 = float(np.mean(np.sum(path_m**2, axis=1)))
     if path_mean_square_m2 < MIN_RMS_DISTANCE_FROM_PATH_MEAN_M**2:

@@ -57,7 +57,7 @@ IMU_OSCILLATES = Unavailable(
 TELEMETRY_IMU_MESSAGES = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
 # Minimum number of time offset estimates before and after a change of the time offset
-MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE = 2
+MIN_OFFSETS_BEFORE_AND_AFTER_CHANGE = 2
 
 # Axes with a noise estimate in the report; north and east have a common estimate
 REPORTED_AXES = (HORIZONTAL, "down")
@@ -375,7 +375,7 @@ def widen_for_scatter(time_offset: SourceTimeOffset, cause: str) -> SourceTimeOf
         change_p_value=_compute_change_p_value(offsets_s, weights),
     )
     # Too few parts to estimate the scatter
-    if len(offsets_s) <= MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE:
+    if len(offsets_s) <= MIN_OFFSETS_BEFORE_AND_AFTER_CHANGE:
         return time_offset
     # Mean square of the deviations from the weighted mean ÷ σ² (chi-square ÷ degrees of freedom)
     variance_factor = _compute_weighted_square_sum(offsets_s, weights) / (len(offsets_s) - 1)
@@ -411,8 +411,8 @@ def _compute_change_p_value(offsets_s: Array, weights: Array) -> float | None:
     """
     degrees_of_freedom = len(offsets_s) - 2
     split_rows = range(
-        MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE,
-        len(offsets_s) - MIN_ESTIMATES_BEFORE_AND_AFTER_CHANGE + 1,
+        MIN_OFFSETS_BEFORE_AND_AFTER_CHANGE,
+        len(offsets_s) - MIN_OFFSETS_BEFORE_AND_AFTER_CHANGE + 1,
     )
     smallest_p_value = 1.0
     for split_row in split_rows:

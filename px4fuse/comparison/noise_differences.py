@@ -133,13 +133,13 @@ def find_noisy_flight_part(
     is_noisy = np.zeros(len(time_s), bool)
     is_noisy[first_row:end_row] = True
 
-    def compute_sigma_ratio(magnitudes: Array) -> float:
+    def compute_noise_increase(magnitudes: Array) -> float:
         return float(np.median(magnitudes[:, is_noisy]) / np.median(magnitudes[:, ~is_noisy]))
 
     innovations_without_outliers = compute_scaled_innovations(np.isin(time_s, outlier_time_s))
     return NoisyFlightPart(
         float(time_s[first_row]),
         float(time_s[end_row - 1]),
-        compute_sigma_ratio(scaled_innovations),
-        compute_sigma_ratio(innovations_without_outliers),
+        compute_noise_increase(scaled_innovations),
+        compute_noise_increase(innovations_without_outliers),
     )

@@ -44,7 +44,7 @@ from px4fuse.readers.px4_innovations import (
 )
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
 from px4fuse.readers.px4_topics import SOURCE_TRACK_NAMES
-from px4fuse.request import ComparisonRequest, HeightName
+from px4fuse.request import ComparisonRequest, HeightSensor
 from px4fuse.trajectory.rotation import to_rotation_matrix
 
 from .model import PreparedComparison
@@ -259,7 +259,7 @@ def _shift_vision_to_ekf2_origin(track: PositionTrack, flight: Flight) -> Positi
 
 
 def _use_barometer_height(
-    track: PositionTrack, flight: Flight, height_sensor: HeightName | None
+    track: PositionTrack, flight: Flight, height_sensor: HeightSensor | None
 ) -> PositionTrack:
     """Replace GNSS height by barometer height, if requested or if EKF2 fused the barometer only."""
     ekf2, barometer_heights, log_name = flight.ekf2, flight.barometer, flight.log.name

@@ -24,7 +24,7 @@ from px4fuse.flight.model import (
 
 # Minimum measurement noise √R (m) that EKF2 uses (ev_pos_control.cpp, EKF2.cpp)
 EKF2_MIN_NOISE_M = 0.01
-MIN_COMMON_SAMPLES = 3
+MIN_COMPARED_SAMPLES = 3
 # NED columns of each quantity that is projected onto an axis, and exponent of the direction cosines
 # (2 for variances)
 PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
@@ -292,6 +292,6 @@ def project_truth(
     if isinstance(truth, Unavailable):
         return truth
     projected_truth = project(truth.samples, axis, segment)
-    if len(projected_truth) < MIN_COMMON_SAMPLES:
+    if len(projected_truth) < MIN_COMPARED_SAMPLES:
         return _make_no_samples_result("ground truth")
     return projected_truth

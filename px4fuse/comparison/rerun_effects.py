@@ -50,7 +50,7 @@ MIN_RMSE_CHANGE_FRACTION = 0.05
 MIN_RMSE_REDUCTION = 0.20
 # A re-run does not correct an overconfident filter if ln(actual σ ÷ reported σ) after the re-run is
 # above this fraction of its value before
-MAX_REMAINING_OVERCONFIDENCE_FRACTION = 0.75
+MAX_OVERCONFIDENCE_FRACTION_AFTER_RERUN = 0.75
 
 
 class RunStatistics(Record, kw_only=True):
@@ -286,7 +286,7 @@ def remains_overconfident(rerun: Rerun) -> bool:
         and classify_sigma_ratio(ratio_before, reference)
         == classify_sigma_ratio(ratio_after, reference)
         == "overconfident"
-        and math.log(ratio_after) > MAX_REMAINING_OVERCONFIDENCE_FRACTION * math.log(ratio_before)
+        and math.log(ratio_after) > MAX_OVERCONFIDENCE_FRACTION_AFTER_RERUN * math.log(ratio_before)
         for reference, ratio_before, ratio_after in compare_sigma_ratios(rerun)
     )
 

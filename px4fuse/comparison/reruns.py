@@ -252,7 +252,7 @@ def _rerun_with_changes(
         original_statistics = logged_statistics or original_statistics
 
     def make_rerun(change: ChangedValues, discrepancies: Iterable[Statistic]) -> Rerun:
-        changed_statistics = rerun_filter(axis_result, change)
+        rerun_statistics = rerun_filter(axis_result, change)
         return Rerun(
             filter="kf" if model is None else "ekf2",
             axis=axis_result.axis.name,
@@ -261,11 +261,11 @@ def _rerun_with_changes(
             discrepancies=tuple(
                 statistic
                 for statistic in discrepancies
-                if original_statistics.value(statistic) and changed_statistics.value(statistic)
+                if original_statistics.value(statistic) and rerun_statistics.value(statistic)
             ),
             before=original_statistics,
             is_logged=is_logged,
-            after=changed_statistics,
+            after=rerun_statistics,
             from_s=None if spans_s is None else spans_s[0][0],
         )
 

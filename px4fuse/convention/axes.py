@@ -32,9 +32,9 @@ MIN_OVERLAP_S = 10.0
 # Residuals are second differences of the positions minus those of the doubly integrated
 # acceleration. Minimum σ (m) of the horizontal residuals: IMU noise and tilt errors are always
 # present
-MIN_HORIZONTAL_SIGMA_M = 0.05
+MIN_HORIZONTAL_RESIDUAL_SIGMA_M = 0.05
 # Minimum σ (m) of the vertical residuals (positions minus doubly integrated acceleration)
-MIN_VERTICAL_SIGMA_M = 0.08
+MIN_VERTICAL_RESIDUAL_SIGMA_M = 0.08
 # Degrees of freedom of the Student distribution of horizontal and vertical residuals
 STUDENT_DEGREES_OF_FREEDOM = 4.0
 METRES_PER_UNIT: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
@@ -295,7 +295,7 @@ def find_convention_candidates(
     delay_s = (np.flatnonzero(has_overlap) - (len(has_overlap) - 1) / 2.0) * GRID_INTERVAL_S
     # Means over the common samples: products of source axes and IMU axes (NED), squares of source
     # axes, squares of IMU axes
-    products, source_squares, imu_squares = (
+    products, source_mean_squares, imu_mean_squares = (
         _compute_cross_moments(source_values, imu_values)[has_overlap]
         / common_sample_counts[has_overlap]
         for source_values, imu_values in (
@@ -311,7 +311,7 @@ def find_convention_candidates(
         if permutation.vertical_axis == 2 or source[:, 2].any()
     ]
     score, rotation_rad = _compute_log_likelihoods(
-        products, source_squares, imu_squares, permutations
+        products, source_mean_squares, imu_mean_squares, permutations
     )
     # The log-likelihood per residual is multiplied by the number of independent residuals
     score *= common_sample_counts[has_overlap] * (GRID_INTERVAL_S / SECOND_DIFFERENCE_WINDOW_S)
@@ -345,7 +345,7 @@ def find_convention_candidates(
 
 def _compute_log_likelihoods(
     products: Array,
-    source_squares: Array,
+    source_mean_squares: Array,
     imu_squares_m2: Array,
     permutations: list[SignedAxisPermutation],
 ) -> ArrayPair:
@@ -358,7 +358,7 @@ def _compute_log_likelihoods(
     ----------
     products : ndarray, shape (offsets, 3, 3)
         Mean products of second differences: axes of the source times north, east, down of the IMU.
-    source_squares : ndarray, shape (offsets, 3, 1)
+    source_mean_squares : ndarray, shape (offsets, 3, 1)
         Mean squares of the second differences along the source's axes.
     imu_squares_m2 : ndarray, shape (offsets, 1, 3)
         Mean squares of the second differences from the IMU.
@@ -380,28 +380,32 @@ def _compute_log_likelihoods(
         horizontal_products[:, first_horizontal_axis]
         - 1j * handedness * horizontal_products[:, second_horizontal_axis]
     )
-    source_squares = np.maximum(source_squares, 1e-12)
+    source_mean_squares = np.maximum(source_mean_squares, 1e-12)
 
     # Mean squares of source minus IMU, for the best rotation: u²·source² + IMU² - 2·u·correlation,
     # with u metres per unit. The horizontal mean square is per axis
     horizontal_mean_square_residual_m2 = (
         metres_per_unit**2
-        * (source_squares[:, first_horizontal_axis] + source_squares[:, second_horizontal_axis])
+        * (
+            source_mean_squares[:, first_horizontal_axis]
+            + source_mean_squares[:, second_horizontal_axis]
+        )
         + imu_squares_m2[..., :2].sum(axis=2, keepdims=True)
         - 2.0 * metres_per_unit * np.abs(correlation)[..., None]
     ) / 2.0
     down_mean_square_residual_m2 = (
-        metres_per_unit**2 * source_squares[:, vertical_axis]
+        metres_per_unit**2 * source_mean_squares[:, vertical_axis]
         + imu_squares_m2[..., 2:]
         - 2.0 * metres_per_unit * (vertical_sign * products[:, vertical_axis, 2])[..., None]
     )
     # Log likelihood ratio of normal residuals: -½ ln σ² of the residuals for each axis, minus
     # -½ ln σ² of the source axis itself (in metres: 3 axes, so 6 ln u in total)
     log_likelihood_per_residual = 0.5 * (
-        np.log(source_squares).sum(axis=1, keepdims=True)
+        np.log(source_mean_squares).sum(axis=1, keepdims=True)
         + 6.0 * np.log(metres_per_unit)
-        - 2.0 * np.log(np.maximum(horizontal_mean_square_residual_m2, MIN_HORIZONTAL_SIGMA_M**2))
-        - np.log(np.maximum(down_mean_square_residual_m2, MIN_VERTICAL_SIGMA_M**2))
+        - 2.0
+        * np.log(np.maximum(horizontal_mean_square_residual_m2, MIN_HORIZONTAL_RESIDUAL_SIGMA_M**2))
+        - np.log(np.maximum(down_mean_square_residual_m2, MIN_VERTICAL_RESIDUAL_SIGMA_M**2))
     )
     return log_likelihood_per_residual, np.angle(correlation)
 
@@ -476,7 +480,7 @@ def _evaluate_hypothesis(
     grid_index, time_s = grid_index[is_used], time_s[is_used]
     elapsed_s = time_s - time_s[0]
     grid_fraction = (fractional_grid_index[is_used] - grid_index)[:, None, None]
-    imu_table_rows = (1.0 - grid_fraction) * imu_motion.table[
+    interpolated_imu_table = (1.0 - grid_fraction) * imu_motion.table[
         grid_index
     ] + grid_fraction * imu_motion.table[grid_index + 1]
     # 2. Residuals: second differences of the source, converted to NED and metres, minus those of
@@ -499,7 +503,7 @@ def _evaluate_hypothesis(
         ]
     )
     imu_second_difference_m = (
-        imu_table_rows[..., 0] - imu_table_rows[..., 1:] @ accelerometer_bias_m_s2
+        interpolated_imu_table[..., 0] - interpolated_imu_table[..., 1:] @ accelerometer_bias_m_s2
     )
     residual = source_second_difference_m - imu_second_difference_m
     # 3. Log likelihoods: horizontal and vertical residuals, then x, y and z of the source without
@@ -508,7 +512,8 @@ def _evaluate_hypothesis(
     log_likelihoods, variances = _fit_student_distributions(
         np.concatenate([residual_squares, unconverted_second_differences.T**2]),
         np.array([2, 1, 1, 1, 1]),
-        np.array([MIN_HORIZONTAL_SIGMA_M, MIN_VERTICAL_SIGMA_M, 1e-6, 1e-6, 1e-6]) ** 2,
+        np.array([MIN_HORIZONTAL_RESIDUAL_SIGMA_M, MIN_VERTICAL_RESIDUAL_SIGMA_M, 1e-6, 1e-6, 1e-6])
+        ** 2,
     )
     # Log likelihood ratio of both models. The density of the positions in metres becomes that in
     # their unit by ln(metres per unit) for each axis. A constant axis (no heights) is omitted
@@ -537,7 +542,7 @@ def _evaluate_hypothesis(
     jacobian[:, 1, HEADING] = complex_second_difference_m.real
     jacobian[..., HEADING_DRIFT] = jacobian[..., HEADING] * elapsed_s[:, None]
     jacobian[..., CLOCK_DRIFT] = jacobian[..., DELAY] * (time_s - mean_time_s)[:, None]
-    jacobian[..., 4:] = imu_table_rows[..., 1:]
+    jacobian[..., 4:] = interpolated_imu_table[..., 1:]
     is_parameter_estimated = np.ones(len(PARAMETER_PRIOR_PRECISION), dtype=bool)
     is_parameter_estimated[HEADING] = hypothesis.has_rotation
     # Only the heading of the gyroscopes drifts

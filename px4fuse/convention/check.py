@@ -48,7 +48,7 @@ from .texts import format_axes, format_delay
 MIN_CONVENTION_LOG_ODDS = 4.0
 # The convention (axes, unit, delay) is not determinable if its log-likelihood (nats) exceeds that
 # of positions unrelated to the measured motion by less than this value
-MIN_LOG_LIKELIHOOD_GAIN = 8.0
+MIN_CONVENTION_LOG_LIKELIHOOD_GAIN = 8.0
 # If no other convention (axes, unit, delay) fits nearly as well, the best one is doubtful below
 # this gain in log-likelihood (nats) per independent residual, relative to positions unrelated to
 # the motion
@@ -306,7 +306,7 @@ def _judge_hypothesis(
     The first of these verdicts that applies is returned: not determinable, doubtful, ambiguous,
     determined. ``is_ambiguous`` is True if other conventions fit nearly as well.
     """
-    if hypothesis.score < MIN_LOG_LIKELIHOOD_GAIN:
+    if hypothesis.score < MIN_CONVENTION_LOG_LIKELIHOOD_GAIN:
         return "not determinable"
     min_gain_per_sample = MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE
     if is_ambiguous:
@@ -363,7 +363,7 @@ def _estimate_clock_drift(
     # refinement of each would take too long
     start_hypothesis, removed_drift = best_hypothesis, 0.0
     if (
-        best_hypothesis.score < MIN_LOG_LIKELIHOOD_GAIN
+        best_hypothesis.score < MIN_CONVENTION_LOG_LIKELIHOOD_GAIN
         or compute_residual_ratio(best_hypothesis, positions) > MAX_RESIDUAL_TO_NOISE_RATIO
     ):
         candidates_and_drifts = [

@@ -181,14 +181,14 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
     rotation_second_differences = SourceSecondDifferences.from_positions(
         inertial_data.time_s, rotation, imu_motion.time_s
     ).second_differences.reshape(-1, 2, 2)
-    horizontal_imu_m = imu_motion.table[:, :2, 0]
+    imu_second_differences_m = imu_motion.table[:, :2, 0]
     # Derivatives of the second differences of the positions with respect to the fitted parameters
     design = np.concatenate(
         [
             rotation_second_differences,  # lever arm forward, right
             imu_motion.second_difference_derivative_m_s[:, :2, None],  # time shift
             imu_motion.table[:, :2, 1:],  # accelerometer bias forward, right, down
-            _rotate(horizontal_imu_m, 90.0)[:, :, None],  # rotation
+            _rotate(imu_second_differences_m, 90.0)[:, :, None],  # rotation
         ],
         axis=2,
     )
@@ -199,7 +199,7 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
             time_s, _rotate(position_samples.to_numpy(), -rotation_deg), imu_motion.time_s
         )
         is_used = is_used & source_motion.is_valid
-        second_difference_error_m = source_motion.second_differences - horizontal_imu_m
+        second_difference_error_m = source_motion.second_differences - imu_second_differences_m
         design_rows = design[is_used].reshape(-1, design.shape[2])
         valid_second_difference_errors_m = second_difference_error_m[is_used].ravel()
         # Second differences with common positions are not independent. One spans 2 windows

@@ -49,7 +49,7 @@ INTEGRATION_STEP_S = 0.02
 # subtracted
 HIGH_PASS_WINDOW_S = 12.0
 # Length (s) of the centred running mean of the specific force that defines the vertical
-LEVELLING_WINDOW_S = 40.0
+GRAVITY_AVERAGING_WINDOW_S = 40.0
 # Length (s) of the windows for the estimate of the gyro bias
 GYRO_BIAS_WINDOW_S = 1.0
 # Minimum interval (s) between two positions that counts as a gap
@@ -212,15 +212,15 @@ def _integrate_gyros(rotation_rad: Array, logged_attitude: Array) -> Array:
 
 def _level_attitude(attitude: Array, specific_force_m_s2: Array) -> Array:
     """Correct the tilt of an attitude, so that the mean specific force is vertical."""
-    # Over LEVELLING_WINDOW_S, the mean acceleration of the vehicle is small, so the mean specific
-    # force is the reaction to gravity (up). Two passes of the mean make a triangular window, which
-    # smooths better than a rectangular one
+    # Over GRAVITY_AVERAGING_WINDOW_S, the mean acceleration of the vehicle is small, so the mean
+    # specific force is the reaction to gravity (up). Two passes of the mean make a triangular
+    # window, which smooths better than a rectangular one
     mean_specific_force_m_s2 = rotate(to_rotation_matrix(attitude[:-1]), specific_force_m_s2)
     for _ in range(2):
         mean_specific_force_m_s2 = running_mean(
             mean_specific_force_m_s2,
             np.ones(len(mean_specific_force_m_s2), dtype=bool),
-            round(LEVELLING_WINDOW_S / INTEGRATION_STEP_S),
+            round(GRAVITY_AVERAGING_WINDOW_S / INTEGRATION_STEP_S),
         )
     # The lower limit (m/s²) prevents a division by zero
     vertical = mean_specific_force_m_s2 / np.maximum(

@@ -53,15 +53,15 @@ MAX_HEADING_DIFFERENCE_DEG = 12.0
 # The score of a convention (quaternion order, frames) measures its agreement with the reference
 # attitude. Lower limit (°) of the median angle differences in the score: smaller differences are
 # noise
-MIN_ANGLE_DIFFERENCE_IN_SCORE_DEG = 0.7
+ANGLE_DIFFERENCE_FLOOR_DEG = 0.7
 # The score of a convention (quaternion order, frames) decreases by this factor · duration (s) ·
 # ln(median angle difference to the reference attitude)
 ANGLE_DIFFERENCE_WEIGHT_PER_S = 0.5
 # For the verdict "determined", the score of the best convention (quaternion order, frames) must
 # exceed that of the second best by this value
 MIN_CONVENTION_SCORE_LEAD = 4.0
-MAX_ORIENTATION_COUNT = 600
-MIN_ORIENTATION_COUNT = 20
+MAX_TESTED_ORIENTATIONS = 600
+MIN_TESTED_ORIENTATIONS = 20
 
 
 class OrientationCandidate(NamedTuple):
@@ -94,12 +94,12 @@ def determine_orientation_convention(
     attitude : ndarray, shape (m, 4)
         Orientations converted to quaternions (w, x, y, z; FRD to NED).
 
-    Return None for fewer than MIN_ORIENTATION_COUNT orientations.
+    Return None for fewer than MIN_TESTED_ORIENTATIONS orientations.
     """
     flight_rows = np.flatnonzero(is_inside_spans(time_s, inertial_data.valid_spans_s))
-    if len(flight_rows) < MIN_ORIENTATION_COUNT:
+    if len(flight_rows) < MIN_TESTED_ORIENTATIONS:
         return None
-    flight_rows = flight_rows[:: math.ceil(len(flight_rows) / MAX_ORIENTATION_COUNT)]
+    flight_rows = flight_rows[:: math.ceil(len(flight_rows) / MAX_TESTED_ORIENTATIONS)]
     sample_times_s, sent_quaternions = time_s[flight_rows], quaternion[flight_rows]
     sent_quaternions = sent_quaternions / np.linalg.norm(sent_quaternions, axis=1, keepdims=True)
     for delay_s in COPY_DELAYS_S:
@@ -189,7 +189,7 @@ def _score_convention(
     # Log likelihood: -(number of independent samples) · Σ ln(median difference). This number is
     # proportional to the duration
     log_angle_differences = np.log(
-        np.maximum([tilt_difference_deg, heading_difference_deg], MIN_ANGLE_DIFFERENCE_IN_SCORE_DEG)
+        np.maximum([tilt_difference_deg, heading_difference_deg], ANGLE_DIFFERENCE_FLOOR_DEG)
     )
     score = (
         -ANGLE_DIFFERENCE_WEIGHT_PER_S * (time_s[-1] - time_s[0]) * np.sum(log_angle_differences)

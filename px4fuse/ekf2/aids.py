@@ -47,7 +47,7 @@ MIN_INNOVATIONS_PER_WINDOW = 5
 # Minimum number of windows before a change of the mean innovation
 MIN_WINDOWS_BEFORE_MEAN_CHANGE = 2
 # Minimum significant change (√S) of the mean innovation
-MIN_MEAN_CHANGE_IN_SIGMA = 0.5
+MIN_INNOVATION_CHANGE_IN_SIGMA = 0.5
 # Minimum ratio of a mean innovation change to the standard deviation of earlier window means
 MIN_MEAN_CHANGE_TO_SCATTER_RATIO = 6.0
 # Maximum time (s) without a fused sample of an enabled aiding source. After 7 s, EKF2 resets its
@@ -299,7 +299,7 @@ def _find_largest_innovation_mean_change(
     window_means = windows["mean"].to_numpy()
     largest_mean_change = None
     # A change must exceed the largest change so far, or this limit for the first
-    min_mean_change = MIN_MEAN_CHANGE_IN_SIGMA
+    min_mean_change = MIN_INNOVATION_CHANGE_IN_SIGMA
     # Test for a change in each window: compare all windows before it with the two after it. The
     # window itself may contain both means, so it is in neither
     for index in range(MIN_WINDOWS_BEFORE_MEAN_CHANGE, len(window_means) - 2):

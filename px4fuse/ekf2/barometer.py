@@ -31,7 +31,7 @@ MAX_RELATIVE_SPREAD_OF_INTERVALS = 0.1
 SAME_SAMPLE_TOLERANCE_IN_INTERVALS = 0.3
 # Maximum number of barometer samples that are reconstructed between two rows of
 # estimator_aid_src_baro_hgt
-MAX_SAMPLES_BETWEEN_LOGGED_ROWS = 30
+MAX_SAMPLES_PER_LOGGED_INTERVAL = 30
 # Maximum weight of a logged barometer sample: the number of EKF2 samples that it represents in the
 # replay, above 1 if neighbouring samples are missing
 MAX_BAROMETER_SAMPLE_WEIGHT = 4.0
@@ -177,7 +177,7 @@ def _combine_barometer_samples(
     is_regular = (
         np.abs(span_s - sample_count * interval_s) < SAME_SAMPLE_TOLERANCE_IN_INTERVALS * interval_s
     )
-    is_regular &= sample_count <= MAX_SAMPLES_BETWEEN_LOGGED_ROWS
+    is_regular &= sample_count <= MAX_SAMPLES_PER_LOGGED_INTERVAL
     sample_interval_by_row_s = span_s / sample_count
     sample_indices = np.arange(sample_count[is_regular].max(initial=1))
     innovation_m = np.full((len(sample_count), len(sample_indices)), np.nan)

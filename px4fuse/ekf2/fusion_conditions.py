@@ -33,7 +33,7 @@ MAX_BUFFERED_POSITIONS = 20
 # Tolerance (s) of a sample interval: half of the timestamp resolution of 1 µs
 INTERVAL_TOLERANCE_S = 5e-7
 # EKF2 stops fusion after it has rejected all samples for this time (s): no_aid_timeout_max
-MAX_REJECTION_DURATION_S = 1.0
+REJECTION_TIMEOUT_S = 1.0
 # A coordinate that varies less than this distance (m) counts as not measured
 MIN_RANGE_OF_MEASURED_COORDINATE_M = 1e-3
 # A GNSS check explains missing GNSS fusion if it fails for at least this fraction of the time
@@ -391,7 +391,7 @@ def _check_gate(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     aid_log = positions.ekf2.aids.get(aid.name)
     if aid_log is None or "rejected" not in aid_log.samples:
         return
-    rejected_fraction = positions.select_samples(aid_log.samples, MAX_REJECTION_DURATION_S)[
+    rejected_fraction = positions.select_samples(aid_log.samples, REJECTION_TIMEOUT_S)[
         "rejected"
     ].mean()
     if rejected_fraction > 0.5:

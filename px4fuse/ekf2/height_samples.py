@@ -30,7 +30,7 @@ DEFAULT_GROUND_EFFECT_DEAD_ZONE_M = 4.0
 # PX4's name of the height reference, by value of EKF2_HGT_REF
 HEIGHT_AID_BY_REFERENCE = {0: BAROMETER.name, 1: GNSS_HGT.name}
 # Maximum time (s) from the start of the replay to the first logged height bias
-MAX_BIAS_LOG_DELAY_S = 1.0
+MAX_FIRST_HEIGHT_BIAS_DELAY_S = 1.0
 # Minimum logging rate (Hz) of the barometer for a replay of its fusion
 MIN_BAROMETER_LOG_HZ = 4.0
 
@@ -83,7 +83,10 @@ def add_heights(
             # EKF2 estimates the bias of the sensor that is not the reference
             (name,) = {*fused_aids} - {reference}
             bias = fusion_record.height_bias_updates.get(name)
-            if bias is None or not bias.index[0] - MAX_BIAS_LOG_DELAY_S < start_s < bias.index[-1]:
+            if (
+                bias is None
+                or not bias.index[0] - MAX_FIRST_HEIGHT_BIAS_DELAY_S < start_s < bias.index[-1]
+            ):
                 return f"EKF2's estimate of the {AIDS[name].label} bias is not logged"
             bias_and_variance = np.array(
                 [np.interp(start_s, bias.index, bias[column]) for column in ("bias_m", "bias_m2")]

@@ -40,10 +40,10 @@ MIN_MEASUREMENT_NOISE_SIGMA = 0.01
 GNSS_HEIGHT_NOISE_FACTOR = 1.5
 # EKF2 flags a bad acceleration if height innovations are too large: that of barometer or GNSS must
 # exceed this multiple of √S (vert_innov_test_lim, common.h)
-MIN_HEIGHT_INNOVATION_SIGMAS_OF_ONE_SENSOR = 3.0
+MIN_BAROMETER_OR_GNSS_INNOVATION_SIGMAS = 3.0
 # For a bad-acceleration flag, the height innovations of both barometer and GNSS must exceed this
 # multiple of √S (vert_innov_test_min, common.h)
-MIN_HEIGHT_INNOVATION_SIGMAS_OF_BOTH_SENSORS = 1.0
+MIN_BAROMETER_AND_GNSS_INNOVATION_SIGMAS = 1.0
 
 
 class BadAccelerationFlag:
@@ -125,16 +125,24 @@ class BadAccelerationFlag:
         # EKF2 tests the latest innovations of barometer and GNSS after each fusion. Test them in
         # this sequence: last samples of the previous event, each barometer sample of this event,
         # GNSS sample of this event
-        latest_barometer = np.full_like(gnss, np.nan)
+        latest_barometer_innovation = np.full_like(gnss, np.nan)
         for sample in previous_barometer:
-            latest_barometer = np.where(np.isnan(sample), latest_barometer, sample)
-        is_acceleration_bad = _has_large_height_innovations(latest_barometer, previous_gnss)
+            latest_barometer_innovation = np.where(
+                np.isnan(sample), latest_barometer_innovation, sample
+            )
+        is_acceleration_bad = _has_large_height_innovations(
+            latest_barometer_innovation, previous_gnss
+        )
         # 2. After each barometer sample of this event. Its GNSS sample is not yet fused
         for sample in barometer:
-            latest_barometer = np.where(np.isnan(sample), latest_barometer, sample)
-            is_acceleration_bad |= _has_large_height_innovations(latest_barometer, previous_gnss)
+            latest_barometer_innovation = np.where(
+                np.isnan(sample), latest_barometer_innovation, sample
+            )
+            is_acceleration_bad |= _has_large_height_innovations(
+                latest_barometer_innovation, previous_gnss
+            )
         # 3. After the GNSS sample of this event
-        is_acceleration_bad |= _has_large_height_innovations(latest_barometer, gnss)
+        is_acceleration_bad |= _has_large_height_innovations(latest_barometer_innovation, gnss)
         is_acceleration_bad &= ~self.uses_logged_flag
         # A flag that is still set continues: only its end changes
         self.since_s = np.where(is_acceleration_bad & (self.until_s < time_s), time_s, self.since_s)
@@ -148,8 +156,8 @@ def _has_large_height_innovations(barometer_innovation: Array, gnss_innovation: 
     """
     larger_innovation = np.maximum(barometer_innovation, gnss_innovation)
     smaller_innovation = np.minimum(barometer_innovation, gnss_innovation)
-    return (larger_innovation > MIN_HEIGHT_INNOVATION_SIGMAS_OF_ONE_SENSOR) & (
-        smaller_innovation > MIN_HEIGHT_INNOVATION_SIGMAS_OF_BOTH_SENSORS
+    return (larger_innovation > MIN_BAROMETER_OR_GNSS_INNOVATION_SIGMAS) & (
+        smaller_innovation > MIN_BAROMETER_AND_GNSS_INNOVATION_SIGMAS
     )
 
 
@@ -276,7 +284,7 @@ class HeightFilter:
         records = self.update_records[[max(event - 1, 0), event]]
         # ν / √S, positive upwards. ν and S are the first two rows of a record
         innovations = -records[:, :, 0] / np.sqrt(records[:, :, 1])
-        if (innovations > MIN_HEIGHT_INNOVATION_SIGMAS_OF_ONE_SENSOR).any():
+        if (innovations > MIN_BAROMETER_OR_GNSS_INNOVATION_SIGMAS).any():
             # The last two columns are GNSS height and GNSS velocity. EKF2 uses the larger
             # innovation; a missing one is NaN
             innovations[:, -2] = np.fmax(innovations[:, -2], innovations[:, -1])

@@ -73,7 +73,7 @@ ROTATE_VISION_BIT = 64
 # Maximum difference (s) between the logged time of an innovation and the time of its sample
 SAMPLE_MATCH_TOLERANCE_S = 0.006
 # Tolerance (s) for rounding errors between sample times and prediction times
-PREDICTION_STEP_TOLERANCE_S = 1e-4
+TIME_ROUNDING_TOLERANCE_S = 1e-4
 # EKF2 reports inertial dead reckoning after this time (s) without horizontal aiding
 # (no_aid_timeout_max, common.h)
 DEAD_RECKONING_TIMEOUT_S = 1.0
@@ -608,7 +608,7 @@ def _read_logged_decisions(
     dead_reckoning_s = _find_dead_reckoning_spans(ekf2, fusion_record, aid)
     # First row in each span, and first row after it
     fusion_to_log_rows, dead_reckoning_rows = (
-        np.searchsorted(earliest_fusion_times_s, spans_s + PREDICTION_STEP_TOLERANCE_S)
+        np.searchsorted(earliest_fusion_times_s, spans_s + TIME_ROUNDING_TOLERANCE_S)
         for spans_s in (fusion_to_log_row_s, dead_reckoning_s)
     )
     for begin, end in (*fusion_to_log_rows, *dead_reckoning_rows):

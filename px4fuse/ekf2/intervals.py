@@ -149,7 +149,7 @@ def make_event_intervals(
         events,
         step_counts.astype(float),
         segment.time_s[events.end_step] - segment.time_s[start_steps],
-        _integrate_state_derivatives(segment, start_steps, step_counts),
+        _integrate_state_jacobian(segment, start_steps, step_counts),
     )
 
 
@@ -253,7 +253,7 @@ def _find_fusion_actions(
     return action, can_start_fusion
 
 
-def _integrate_state_derivatives(
+def _integrate_state_jacobian(
     segment: ReplaySegment, start_steps: IntArray, prediction_step_counts: IntArray
 ) -> Array:
     """Return the derivatives of the motion state at the end of each interval.

@@ -80,7 +80,7 @@ from .replay_segments import (
 MAX_HORIZON_DELAY_S = 1.0
 
 # Number of replays that are computed at once; limits the memory
-REPLAY_BATCH_SIZE = 10
+CONFIGURATIONS_PER_BATCH = 10
 # Number of intervals between fusions whose states are computed at once; limits the memory
 EVENTS_PER_BLOCK = 512
 
@@ -232,9 +232,9 @@ def replay_with_settings(
     runs: Sequence[SegmentRun] = ()
     for index, (configuration, change) in enumerate(zip(configurations, changes, strict=True)):
         # The configurations of a batch are computed at once, before the first of them is used
-        if index % REPLAY_BATCH_SIZE == 0:
+        if index % CONFIGURATIONS_PER_BATCH == 0:
             runs = ()  # free the memory before the next batch
-            runs = _run_model(model, configurations[index : index + REPLAY_BATCH_SIZE])
+            runs = _run_model(model, configurations[index : index + CONFIGURATIONS_PER_BATCH])
         replay = _make_replay(inputs, runs, configuration, change)
         updates = replay.updates
         if excluded_times_s is not None:

@@ -73,7 +73,7 @@ MAX_REJECTED_FRACTION_FOR_COMPARISON = 0.05
 MOSTLY_REJECTED_FRACTION = 0.5
 # Minimum correlation of replayed and logged innovations if EKF2 rejects more than
 # MOSTLY_REJECTED_FRACTION of the positions
-MIN_CORRELATION_IF_MOSTLY_REJECTED = 0.99
+MIN_INNOVATION_CORRELATION_IF_MOSTLY_REJECTED = 0.99
 # Maximum difference between the fractions of rejected positions in replay and log, if they agree
 MAX_REJECTED_FRACTION_DIFFERENCE = 0.05
 # Maximum relative difference of the mean NIS in replay and log, if they agree
@@ -160,7 +160,7 @@ class ReplayAgreement(Record, kw_only=True):
         """Agreement of replayed and logged position innovations, by horizontal axis."""
         return {"north": self.north, "east": self.east}
 
-    def as_unavailable(self, result_name: str) -> Unavailable:
+    def report_disagreement(self, result_name: str) -> Unavailable:
         profile = "SDLOG_PROFILE 129 (default and vision)"
         if self.gnss_pos:
             profile = "SDLOG_PROFILE 3 (default and full rates)"
@@ -251,7 +251,7 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> ReplayAgreement | Un
             comparison,
             "Record a longer flight with motion, with SDLOG_PROFILE bit 0 (default).",
         )
-    agreement_by_axis, statistics = comparison
+    agreement_by_axis, agreement_statistics = comparison
     agreement_by_aid, omitted_aids = _compare_other_aids(ekf2, replay, state_difference)
     agreement_by_aid[aid.name] = agreement_by_axis
     # While EKF2 fuses only optical flow, position errors accumulate. Replay and log are therefore
@@ -274,7 +274,7 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> ReplayAgreement | Un
     return ReplayAgreement(
         **agreement_by_axis,  # north and east
         **agreement_by_aid,  # ev_pos, gnss_pos, gnss_vel, and so on
-        **statistics,  # samples to decisions_same, good and reason
+        **agreement_statistics,  # samples to decisions_same, good and reason
         doubtful=omitted_aids,
         published_rms_difference_m=math.hypot(
             *(axis.position_rms_difference_m for axis in agreement_by_axis.values())
@@ -288,7 +288,7 @@ def _compare_innovations(
     replay: Ekf2Replay,
     replayed_innovations: pd.DataFrame,
     logged_innovations: pd.DataFrame,
-    has_measurement_times: bool,
+    has_logged_measurement_times: bool,
     state_difference: pd.DataFrame,
 ) -> tuple[dict[str, Any], dict[str, Any]] | str:
     """Compare replayed with logged innovations.
@@ -300,7 +300,7 @@ def _compare_innovations(
     update_rows = match_updates(
         replayed_innovations,
         logged_innovations.index.to_numpy(),
-        has_measurement_times=has_measurement_times,
+        has_logged_measurement_times=has_logged_measurement_times,
     )
     is_used = (update_rows >= 0) & is_inside_spans(
         logged_innovations.index, replay.find_evaluated_spans()
@@ -398,9 +398,9 @@ def _compare_other_aids(
         if isinstance(comparison, str):
             reason = comparison
         else:
-            agreement_by_aid[name], statistics = comparison
-            if not statistics["good"]:
-                reason = statistics["reason"]
+            agreement_by_aid[name], agreement_statistics = comparison
+            if not agreement_statistics["good"]:
+                reason = agreement_statistics["reason"]
         # GNSS velocity is omitted only if its innovations are constant, as those of a frozen sensor
         if reason and (name != GNSS_VEL.name or reason == CONSTANT_INNOVATIONS_REASON):
             omitted_aids[name] = reason
@@ -455,13 +455,13 @@ def rows_inside(table: T, spans_s: Spans) -> T:
 
 
 def match_updates(
-    updates: pd.DataFrame, logged_times_s: Array, *, has_measurement_times: bool
+    updates: pd.DataFrame, logged_times_s: Array, *, has_logged_measurement_times: bool
 ) -> IntArray:
     """Return for each logged innovation the row of its replayed update, or -1.
 
-    ``has_measurement_times`` is True for estimator_aid_src topics.
+    ``has_logged_measurement_times`` is True for estimator_aid_src topics.
     """
-    if has_measurement_times:
+    if has_logged_measurement_times:
         return find_matching_samples(updates.index.to_numpy(), logged_times_s)
     # The log contains EKF2's innovations at the logging times: those of the latest update. 0.1 ms
     # allows for rounding errors of times
@@ -620,11 +620,11 @@ def judge_agreement_with_logged_rejections(
     """
     rejected_fraction = agreement.rejected_fraction_logged
     is_mostly_rejected = rejected_fraction > MOSTLY_REJECTED_FRACTION
-    limits = DIFFERENCE_FACTOR_WITH_MANY_REJECTIONS, MIN_INNOVATION_CORRELATION
+    agreement_limits = DIFFERENCE_FACTOR_WITH_MANY_REJECTIONS, MIN_INNOVATION_CORRELATION
     if is_mostly_rejected:
-        limits = np.inf, MIN_CORRELATION_IF_MOSTLY_REJECTED
+        agreement_limits = np.inf, MIN_INNOVATION_CORRELATION_IF_MOSTLY_REJECTED
     is_in_agreement, reason = _judge_agreement(
-        agreement_with_logged_rejections.axes, 0.0, 0.0, *limits
+        agreement_with_logged_rejections.axes, 0.0, 0.0, *agreement_limits
     )
     reason = f"in a replay that rejects the same samples as EKF2, {reason}"
     if is_mostly_rejected and not is_in_agreement:

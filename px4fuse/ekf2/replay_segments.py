@@ -245,7 +245,7 @@ def group_samples_by_event(
     segment: ReplaySegment,
     event_steps: IntArray,
     measurement_step_indices: IntArray,
-    position_m: Array,
+    measured_position_m: Array,
     axes: slice,
     *quantities: Array,
 ) -> Array:
@@ -260,7 +260,7 @@ def group_samples_by_event(
         Prediction step in which each event occurs, increasing.
     measurement_step_indices : ndarray of int, shape (m,)
         Prediction step in which each sample was measured, increasing.
-    position_m : ndarray, shape (m, a)
+    measured_position_m : ndarray, shape (m, a)
         Measured positions along ``axes``.
     axes : slice
         Indices of the measured axes in NED; a is their number.
@@ -293,7 +293,7 @@ def group_samples_by_event(
     # 3. Index of each sample in its event: its row minus the first row of the event
     index_in_event = np.arange(sample_count) - np.searchsorted(event_indices, event_indices)
     columns = (
-        *(position_m[:sample_count] + displacement_m[:, axes]).T,
+        *(measured_position_m[:sample_count] + displacement_m[:, axes]).T,
         age_s,
         *(column[:sample_count] for column in quantities),
         np.ones(sample_count),

@@ -50,23 +50,23 @@ NO_TRUTH_OVERLAP = Unavailable(
 )
 # Names of the properties in which KF and EKF2 differ. KF's properties are replaced by those of EKF2
 # one after the other
-SAMPLE_TIMES_REPLACEMENT_NAME = "sample times and time steps"
-TIMESTAMPS_REPLACEMENT_NAME = "timestamps and delay"
-MEASUREMENT_NOISE_REPLACEMENT_NAME = "measurement noise"
-ACCELEROMETER_BIAS_REPLACEMENT_NAME = "accelerometer bias state"
-PROCESS_NOISE_REPLACEMENT_NAME = "process noise"
-ATTITUDE_REPLACEMENT_NAME = "attitude and gyro bias states"
-MAGNETOMETER_REPLACEMENT_NAME = "magnetometer"
-GNSS_VELOCITY_REPLACEMENT_NAME = "GNSS velocity"
-FLOW_REPLACEMENT_NAME = "optical flow"
-VISION_REPLACEMENT_NAME = "external vision"
-REJECTION_REPLACEMENT_NAME = "rejections and resets"
-OUTPUT_PREDICTOR_REPLACEMENT_NAME = "output predictor"
+SAMPLE_TIMES_PROPERTY_NAME = "sample times and time steps"
+TIMESTAMPS_PROPERTY_NAME = "timestamps and delay"
+MEASUREMENT_NOISE_PROPERTY_NAME = "measurement noise"
+ACCELEROMETER_BIAS_PROPERTY_NAME = "accelerometer bias state"
+PROCESS_NOISE_PROPERTY_NAME = "process noise"
+ATTITUDE_PROPERTY_NAME = "attitude and gyro bias states"
+MAGNETOMETER_PROPERTY_NAME = "magnetometer"
+GNSS_VELOCITY_PROPERTY_NAME = "GNSS velocity"
+FLOW_PROPERTY_NAME = "optical flow"
+VISION_PROPERTY_NAME = "external vision"
+REJECTION_PROPERTY_NAME = "rejections and resets"
+OUTPUT_PREDICTOR_PROPERTY_NAME = "output predictor"
 # Properties that consist of the fusion of a further aiding source by EKF2, by PX4's name of the
 # source
 REPLACEMENT_NAME_BY_ADDITIONAL_AID = {
-    FLOW.name: FLOW_REPLACEMENT_NAME,
-    EV_POS.name: VISION_REPLACEMENT_NAME,
+    FLOW.name: FLOW_PROPERTY_NAME,
+    EV_POS.name: VISION_PROPERTY_NAME,
 }
 
 
@@ -183,12 +183,12 @@ def explain_difference_by_replacements(
         Results of KF by horizontal axis.
     """
     if not model.agreement.good:
-        return model.agreement.as_unavailable(DIFFERENCE_ANALYSIS_NAME)
+        return model.agreement.report_disagreement(DIFFERENCE_ANALYSIS_NAME)
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    configurations = make_replacement_configurations(model.inputs, settings)
+    configurations = make_stepwise_configurations(model.inputs, settings)
     # baseline_replay contains the track of this configuration
-    del configurations[REJECTION_REPLACEMENT_NAME]
+    del configurations[REJECTION_PROPERTY_NAME]
     baseline_replay = replay_with_logged_rejections(model)
     evaluated_spans = model.baseline_replay.find_evaluated_spans()
     state_times_s = ekf2.state.index.to_numpy()
@@ -230,8 +230,8 @@ def explain_difference_by_replacements(
         baseline_replay, track, state_span_s, evaluated_spans
     )
     states_by_replacement |= {
-        REJECTION_REPLACEMENT_NAME: select_states(baseline_replay.delayed_state),
-        OUTPUT_PREDICTOR_REPLACEMENT_NAME: select_states(baseline_replay.published_state),
+        REJECTION_PROPERTY_NAME: select_states(baseline_replay.delayed_state),
+        OUTPUT_PREDICTOR_PROPERTY_NAME: select_states(baseline_replay.published_state),
     }
     logged_states = select_states(ekf2.state)
     spans = Segment(*state_span_s, "").clip_spans(evaluated_spans)
@@ -321,7 +321,7 @@ def _explain_difference_along_axis(
     )
 
 
-def make_replacement_configurations(
+def make_stepwise_configurations(
     inputs: ReplayInputs, kf_settings: Settings
 ) -> dict[str, FilterConfiguration]:
     """Return filter configurations for replays that change step by step from KF to EKF2.
@@ -357,35 +357,35 @@ def make_replacement_configurations(
     # For each property, the fields of FilterConfiguration that change from KF to EKF2, in the order
     # of the replays
     replacements: dict[str, dict[str, Any]] = {
-        TIMESTAMPS_REPLACEMENT_NAME: {
+        TIMESTAMPS_PROPERTY_NAME: {
             "settings": {**logged_settings, **kf_noises},
             "timestamp_offset_s": None,
         },
-        MEASUREMENT_NOISE_REPLACEMENT_NAME: {
+        MEASUREMENT_NOISE_PROPERTY_NAME: {
             "settings": {**logged_settings, **kf_process_noise},
             "uses_reported_noise": True,
         },
-        ACCELEROMETER_BIAS_REPLACEMENT_NAME: {"estimates_biases": True},
-        PROCESS_NOISE_REPLACEMENT_NAME: {"settings": logged_settings},
-        ATTITUDE_REPLACEMENT_NAME: {"estimates_attitude": True},
+        ACCELEROMETER_BIAS_PROPERTY_NAME: {"estimates_biases": True},
+        PROCESS_NOISE_PROPERTY_NAME: {"settings": logged_settings},
+        ATTITUDE_PROPERTY_NAME: {"estimates_attitude": True},
     }
     if MAG.name in other_aids:
-        replacements[MAGNETOMETER_REPLACEMENT_NAME] = {
+        replacements[MAGNETOMETER_PROPERTY_NAME] = {
             "disable_time_s_by_aid": dict.fromkeys(additional_aids, 0.0)
         }
     if GNSS_VEL.name in other_aids:
-        replacements[GNSS_VELOCITY_REPLACEMENT_NAME] = {"fuses_velocity": True}
+        replacements[GNSS_VELOCITY_PROPERTY_NAME] = {"fuses_velocity": True}
     # Enable the additional sources one after the other; those after ``name`` stay disabled
     for index, name in enumerate(additional_aids):
         replacements[REPLACEMENT_NAME_BY_ADDITIONAL_AID[name]] = {
             "disable_time_s_by_aid": dict.fromkeys(additional_aids[index + 1 :], 0.0)
         }
     # 3. One configuration per replacement. The last is EKF2 with its logged decisions
-    configurations = {SAMPLE_TIMES_REPLACEMENT_NAME: configuration}
+    configurations = {SAMPLE_TIMES_PROPERTY_NAME: configuration}
     for name, changes in replacements.items():
         configuration = replace(configuration, **changes)
         configurations[name] = configuration
-    configurations[REJECTION_REPLACEMENT_NAME] = FilterConfiguration(
+    configurations[REJECTION_PROPERTY_NAME] = FilterConfiguration(
         logged_settings, uses_logged_decisions=True
     )
     return configurations

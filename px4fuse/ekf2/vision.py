@@ -30,7 +30,7 @@ from .replay_segments import (
 MAX_SAMPLE_GAP_S = 0.4
 # EKF2 resets the vision bias or the position after this time (s) with only rejected samples:
 # no_aid_timeout_max (common.h)
-MAX_REJECTION_DURATION_S = 1.0
+REJECTION_TIMEOUT_S = 1.0
 
 
 def _group_vision_by_event(
@@ -208,16 +208,16 @@ class VisionFilter:
             is_outside_gate = is_tested & is_innovation_large & self.has_gate
             is_fused = is_tested & ~is_outside_gate
             is_rejection_timed_out = is_outside_gate & (
-                fusion_time_s - self.last_attempt_s > MAX_REJECTION_DURATION_S
+                fusion_time_s - self.last_attempt_s > REJECTION_TIMEOUT_S
             )
-            is_restarting = (has_sample & must_restart) | is_rejection_timed_out
+            is_fusion_restarting = (has_sample & must_restart) | is_rejection_timed_out
             # A restart resets the position if vision is the only position source, or if EKF2 has
             # fused neither vision nor GNSS for a time. Otherwise, it sets the vision bias
-            is_gnss_timed_out = fusion_time_s - last_gnss_fusion_s > MAX_REJECTION_DURATION_S
-            is_position_reset = is_restarting & (
+            is_gnss_timed_out = fusion_time_s - last_gnss_fusion_s > REJECTION_TIMEOUT_S
+            is_position_reset = is_fusion_restarting & (
                 is_gnss_off | (is_rejection_timed_out & is_gnss_timed_out)
             )
-            is_bias_initialised = is_restarting & ~is_position_reset
+            is_bias_initialised = is_fusion_restarting & ~is_position_reset
             # If EKF2 resets its position to a sample, it logs innovation 0
             update_record = (
                 *np.where(is_position_reset, 0.0, nu.T),
@@ -253,7 +253,7 @@ class VisionFilter:
             # 5. Times of the last sample, attempt and fusion
             self.last_sample_s[has_sample] = fusion_time_s[has_sample]
             self.last_attempt_s = np.where(
-                is_fused | is_restarting, fusion_time_s, self.last_attempt_s
+                is_fused | is_fusion_restarting, fusion_time_s, self.last_attempt_s
             )
             self.last_fusion_s = np.where(
                 is_fused | is_position_reset, fusion_time_s, self.last_fusion_s

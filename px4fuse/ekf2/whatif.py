@@ -173,10 +173,17 @@ class Ekf2Statistics(Record, kw_only=True, omit_defaults=False):
     @property
     def position_rmse_to_truth_m(self) -> float | Unavailable:
         """Horizontal RMSE of the published position against ground truth (m)."""
-        north_m, east_m = self.north.position_rmse_to_truth_m, self.east.position_rmse_to_truth_m
-        if isinstance(north_m, Unavailable):
-            return north_m
-        return east_m if isinstance(east_m, Unavailable) else float(np.hypot(north_m, east_m))
+        north_rmse_m, east_rmse_m = (
+            self.north.position_rmse_to_truth_m,
+            self.east.position_rmse_to_truth_m,
+        )
+        if isinstance(north_rmse_m, Unavailable):
+            return north_rmse_m
+        return (
+            east_rmse_m
+            if isinstance(east_rmse_m, Unavailable)
+            else float(np.hypot(north_rmse_m, east_rmse_m))
+        )
 
 
 @dataclass(frozen=True)
@@ -226,7 +233,7 @@ def what_if(
         Unknown parameter or aiding source, value outside PX4's range, or no time to evaluate.
     """
     if not model.agreement.good:
-        return model.agreement.as_unavailable(ANALYSIS_NAME)
+        return model.agreement.report_disagreement(ANALYSIS_NAME)
     flight = model.flight
     spans_s = model.baseline_replay.find_evaluated_spans()
     if disable_time_s_by_aid:

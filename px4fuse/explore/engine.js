@@ -6,8 +6,8 @@ const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 const inflate = (text) => new Response(new Blob([Uint8Array.from(atob(text), (c) => c.charCodeAt(0))])
   .stream().pipeThrough(new DecompressionStream("deflate")));
 const Engine = (() => {
-  // steps.MAX_SAME_TIME_S, signals.MIN_MEASUREMENTS, projection.MIN_COMMON_SAMPLES, consistency.MIN_INNOVATIONS
-  const SAME_TIME_S = 5e-7, MIN_MEASUREMENTS = 3, MIN_COMMON_SAMPLES = 3, MIN_INNOVATIONS = 10;
+  // steps.MAX_SAME_TIME_S, signals.MIN_MEASUREMENTS, projection.MIN_COMPARED_SAMPLES, consistency.MIN_INNOVATIONS
+  const SAME_TIME_S = 5e-7, MIN_MEASUREMENTS = 3, MIN_COMPARED_SAMPLES = 3, MIN_INNOVATIONS = 10;
 
   /* numpy.interp for ascending x; `outside` replaces the end values beyond the range of xp */
   function interp(x, xp, fp, outside) {
@@ -149,10 +149,10 @@ const Engine = (() => {
     return { count: nu.length, nis: mean(normalised.map((x) => x * x)), outside: mean(normalised.map((x) => Math.abs(x) > 2)) };
   }
 
-  /* Root mean square difference of two series, null for fewer than MIN_COMMON_SAMPLES */
+  /* Root mean square difference of two series, null for fewer than MIN_COMPARED_SAMPLES */
   function rmse(values, reference) {
     const squares = Array.from(values, (value, i) => (value - reference[i]) ** 2).filter(Number.isFinite);
-    return squares.length < MIN_COMMON_SAMPLES ? null : Math.sqrt(mean(squares));
+    return squares.length < MIN_COMPARED_SAMPLES ? null : Math.sqrt(mean(squares));
   }
 
   /* Decode the arrays of px4fuse.explore.data */

@@ -172,15 +172,17 @@ def compute_nis_band(count: int, dimension_count: int = 1) -> Limits:
 
 
 def classify_sigma_ratio(
-    ratio: float, reference: Reference, interval: Limits | None = None
+    ratio: float, reference: Reference, ratio_interval: Limits | None = None
 ) -> SigmaVerdict:
     """Classify a filter by the ratio of its actual to its reported σ.
 
     A ratio inside :data:`CONSISTENT_SIGMA_RATIOS` is consistent.
-    A 95 % ``interval`` that contains 1 is also consistent.
+    A 95 % ``ratio_interval`` that contains 1 is also consistent.
     """
     low, high = CONSISTENT_SIGMA_RATIOS[reference]
-    if low <= ratio <= high or (interval is not None and interval[0] <= 1.0 <= interval[1]):
+    if low <= ratio <= high or (
+        ratio_interval is not None and ratio_interval[0] <= 1.0 <= ratio_interval[1]
+    ):
         return "consistent"
     return "overconfident" if ratio > 1.0 else "underconfident"
 

@@ -95,7 +95,7 @@ class SourceLowPass:
         Correlation of the noise of successive positions; 0 for no filter.
     lag_s : float
         Lag of the positions at constant velocity.
-    gain_nats : float
+    likelihood_gain_nats : float
         Log likelihood (nats) of the innovations with the low-pass filter, minus their log
         likelihood with white noise only.
     sigma_z_m : float
@@ -104,7 +104,7 @@ class SourceLowPass:
 
     correlation: float
     lag_s: float
-    gain_nats: float
+    likelihood_gain_nats: float
     sigma_z_m: float
 
 
@@ -118,9 +118,9 @@ class TimeCorrelatedNoise:
         Correlation time, and the ends of its 95 % interval.
     slow_m, white_m : float
         Standard deviation of time-correlated (slow) and of white noise, per axis.
-    gain_nats : float
+    likelihood_gain_nats : float
         Log likelihood (nats) with time-correlated noise minus log likelihood with white noise.
-    low_pass_gain_nats : float
+    low_pass_likelihood_gain_nats : float
         Log likelihood (nats) with a low-pass filter instead, minus log likelihood with
         time-correlated noise.
     """
@@ -130,8 +130,8 @@ class TimeCorrelatedNoise:
     high_s: float
     slow_m: float
     white_m: float
-    gain_nats: float
-    low_pass_gain_nats: float
+    likelihood_gain_nats: float
+    low_pass_likelihood_gain_nats: float
 
 
 # Unfiltered positions are the positions before the low-pass filter of the source. First: unfiltered
@@ -249,7 +249,7 @@ def fit_time_correlation(
     compute_motion = partial(
         compute_imu_motion,
         flight,
-        directions=np.array([axis.direction for axis in axes]),
+        axis_directions=np.array([axis.direction for axis in axes]),
         dt_s=settings.dt_s,
         motion_cache=motion_cache,
     )
@@ -261,7 +261,9 @@ def fit_time_correlation(
         return imu_motion
     tested_offsets_s = sorted({0.0, clock_offset_s})
     sigma_z_m = noise_parameters.sigma_z_m
-    no_low_pass = SourceLowPass(correlation=0.0, lag_s=0.0, gain_nats=0.0, sigma_z_m=sigma_z_m)
+    no_low_pass = SourceLowPass(
+        correlation=0.0, lag_s=0.0, likelihood_gain_nats=0.0, sigma_z_m=sigma_z_m
+    )
     no_correlation_found = Unavailable(
         "time-correlated noise of the positions", "the position errors are not time-correlated", ""
     )
@@ -298,8 +300,8 @@ def fit_time_correlation(
     )
     white_noise_score = white_noise_fit.compute_score()
     # 3. A low-pass filter is fitted only if the noise is time-correlated or very small
-    gain_nats = white_noise_score - correlated_noise_fit.compute_score()
-    is_correlated = gain_nats >= MIN_LIKELIHOOD_GAIN_NATS
+    likelihood_gain_nats = white_noise_score - correlated_noise_fit.compute_score()
+    is_correlated = likelihood_gain_nats >= MIN_LIKELIHOOD_GAIN_NATS
     if not (is_correlated or is_sigma_z_small):
         return no_low_pass, no_correlation_found
     low_pass = _fit_low_pass(
@@ -308,7 +310,7 @@ def fit_time_correlation(
         white_noise_fit.noise_parameters,
         white_noise_score,
     )
-    source_low_pass = low_pass if low_pass.gain_nats > 0.0 else no_low_pass
+    source_low_pass = low_pass if low_pass.likelihood_gain_nats > 0.0 else no_low_pass
     if not is_correlated:
         return source_low_pass, no_correlation_found
     # Both gains are relative to white noise, so their difference compares low pass and correlated
@@ -320,9 +322,9 @@ def fit_time_correlation(
         high_s=np.inf,
         slow_m=fitted_parameters.correlated_sigma_m,
         white_m=fitted_parameters.sigma_z_m,
-        gain_nats=gain_nats,
-        low_pass_gain_nats=low_pass.gain_nats
-        - gain_nats
+        likelihood_gain_nats=likelihood_gain_nats,
+        low_pass_likelihood_gain_nats=low_pass.likelihood_gain_nats
+        - likelihood_gain_nats
         + (TIME_OFFSET_PENALTY_NATS if offset_s else 0.0),
     )
 
@@ -333,24 +335,24 @@ def fit_time_correlation_to_truth(
     outlier_time_s: Array,
     clock_offset_s: float,
     jumps: Sequence[Jump],
-    noise_fitted_with_imu: TimeCorrelatedNoise | Unavailable,
+    correlated_noise_from_imu: TimeCorrelatedNoise | Unavailable,
     low_pass: SourceLowPass,
 ) -> TimeCorrelatedNoise | Unavailable:
     """Fit time-correlated noise to the position errors against ground truth.
 
-    Frame errors and time offsets are removed from the errors. ``noise_fitted_with_imu`` is returned
-    if its log-likelihood gain over white noise is larger.
+    Frame errors and time offsets are removed from the errors. ``correlated_noise_from_imu`` is
+    returned if its log-likelihood gain over white noise is larger.
 
     Model: the covariance of the errors is σ² ((1 - f) I + f C), with C = exp(-|Δt| / τ). For each
     tested τ and f, the most likely σ² is known in closed form.
     """
     min_likelihood_gain_nats = MIN_TRUTH_LIKELIHOOD_GAIN_NATS
-    low_pass_likelihood_gain_nats = low_pass.gain_nats
-    if isinstance(noise_fitted_with_imu, TimeCorrelatedNoise):
+    low_pass_likelihood_gain_nats = low_pass.likelihood_gain_nats
+    if isinstance(correlated_noise_from_imu, TimeCorrelatedNoise):
         min_likelihood_gain_nats = max(
-            MIN_TRUTH_LIKELIHOOD_GAIN_NATS, noise_fitted_with_imu.gain_nats
+            MIN_TRUTH_LIKELIHOOD_GAIN_NATS, correlated_noise_from_imu.likelihood_gain_nats
         )
-        low_pass_likelihood_gain_nats = noise_fitted_with_imu.low_pass_gain_nats
+        low_pass_likelihood_gain_nats = correlated_noise_from_imu.low_pass_likelihood_gain_nats
     # 1. Positions near a sample of ground truth, without outliers, downsampled
     true_track = pd.concat([truth["position_m"] for truth in truths], axis=1).dropna()
     measurement_time_s = np.setdiff1d(axes[0].measurement_time_s, outlier_time_s)
@@ -365,13 +367,13 @@ def fit_time_correlation_to_truth(
     ]
     position_count = len(measurement_time_s)
     if position_count < MIN_MEASUREMENTS:
-        return noise_fitted_with_imu
+        return correlated_noise_from_imu
     measured_m = np.transpose(
         [axis.measurement_m[np.isin(axis.measurement_time_s, measurement_time_s)] for axis in axes]
     )
-    true_spline = CubicSpline(true_track.index, true_track)
+    truth_spline = CubicSpline(true_track.index, true_track)
     true_m, true_velocity_m_s = (
-        true_spline(measurement_time_s + clock_offset_s, order) for order in (0, 1)
+        truth_spline(measurement_time_s + clock_offset_s, order) for order in (0, 1)
     )
     # 2. Residuals: errors without the systematic errors, which are one constant, scale and rotation
     # (true_m), a time offset of each flight part, and the jumps. A time offset changes the position
@@ -393,7 +395,7 @@ def fit_time_correlation_to_truth(
     ]
     residuals = basis_without_systematic_errors.T @ (measured_m - true_m)
     if np.abs(residuals).max() < MAX_RESIDUAL_OF_COPIED_TRUTH_M:
-        return noise_fitted_with_imu
+        return correlated_noise_from_imu
     white_noise_score = 0.5 * len(residuals) * np.log(np.mean(residuals**2, axis=0)).sum()
 
     # 3. Log likelihood for each τ and each fraction f of time-correlated noise
@@ -426,7 +428,7 @@ def fit_time_correlation_to_truth(
         for tau in TESTED_CORRELATION_TIMES_S[::4].tolist()
     )
     if white_noise_score - coarse_score < min_likelihood_gain_nats / 2.0:
-        return noise_fitted_with_imu
+        return correlated_noise_from_imu
     scores_and_variances = [*map(compute_scores_and_variances, TESTED_CORRELATION_TIMES_S.tolist())]
     # Rows are time constants, columns time-correlated fractions of the variance
     scores, normalised_mean_squares = np.transpose(scores_and_variances, (1, 0, 2))
@@ -436,7 +438,7 @@ def fit_time_correlation_to_truth(
     likelihood_gains_nats = white_noise_score - scores.min(axis=1)
     best_gain_nats = likelihood_gains_nats.max()
     if best_gain_nats < min_likelihood_gain_nats:
-        return noise_fitted_with_imu
+        return correlated_noise_from_imu
     # 4. 95 % interval of τ from the profile likelihood
     first_tau_index, last_tau_index = np.flatnonzero(
         likelihood_gains_nats > best_gain_nats - MAX_LOG_LIKELIHOOD_DROP
@@ -451,8 +453,8 @@ def fit_time_correlation_to_truth(
         high_s=taus_s[last_tau_index + 1],
         slow_m=(variance_m2 * fraction) ** 0.5,
         white_m=(variance_m2 * (1.0 - fraction)) ** 0.5,
-        gain_nats=float(best_gain_nats),
-        low_pass_gain_nats=low_pass_likelihood_gain_nats,
+        likelihood_gain_nats=float(best_gain_nats),
+        low_pass_likelihood_gain_nats=low_pass_likelihood_gain_nats,
     )
 
 

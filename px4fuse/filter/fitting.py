@@ -53,7 +53,7 @@ UNCOMPUTABLE_SCORE = 1e6
 # Step of ln σ for numerical derivatives of the log-likelihood
 LOG_STEP_FOR_DERIVATIVES = 1e-4
 # Grid for the interpolation of the log-likelihood: number of nodes, and spacing in ln σ
-GRID_NODE_COUNT, GRID_NODE_SPACING = 6, 0.2
+GRID_NODE_COUNT, LN_SIGMA_NODE_SPACING = 6, 0.2
 GRID_NODES = np.arange(GRID_NODE_COUNT)
 BARYCENTRIC_WEIGHTS = (-1.0) ** GRID_NODES * comb(GRID_NODE_COUNT - 1, GRID_NODES)
 # In a long flight, a first fit to this number of measurements gives the initial values
@@ -129,11 +129,11 @@ class NegativeLogLikelihood:
             positions.process_noise_independent_of_sigma_a.any() for positions in positions_by_axis
         )
 
-        # Node i of the grid has the coordinate i · GRID_NODE_SPACING
+        # Node i of the grid has the coordinate i · LN_SIGMA_NODE_SPACING
         @cache
         def fit_axes(ratio_index: int) -> list[PositionFit]:
             """Fit each axis with the ratio SIGMA_A / SIGMA_Z of a grid node."""
-            sigma_a_m_s2 = exp(GRID_NODE_SPACING * ratio_index) * sigma_z_m
+            sigma_a_m_s2 = exp(LN_SIGMA_NODE_SPACING * ratio_index) * sigma_z_m
             return [
                 fit_constant_errors(
                     [positions], NoiseParameters(sigma_a_m_s2, sigma_z_m), measurement_weights
@@ -144,7 +144,7 @@ class NegativeLogLikelihood:
         @cache
         def compute_scores_at_nodes(ratio_index: int, first_sigma_z_index: int) -> Array:
             """Return -ln p at the ratio of one node, and at GRID_NODE_COUNT successive SIGMA_Z."""
-            sigmas_z_m = np.exp(GRID_NODE_SPACING * (first_sigma_z_index + GRID_NODES))
+            sigmas_z_m = np.exp(LN_SIGMA_NODE_SPACING * (first_sigma_z_index + GRID_NODES))
             return np.asarray(
                 sum(
                     axis_fit.compute_scores(sigmas_z_m / sigma_z_m)[:, 0]
@@ -166,8 +166,10 @@ class NegativeLogLikelihood:
             )
         log_sigma_z = log(noise_parameters.sigma_z_m)
         log_ratio = log(noise_parameters.sigma_a_m_s2) - log_sigma_z
-        ratio_index, ratio_weights = _interpolate_between_nodes(log_ratio / GRID_NODE_SPACING)
-        sigma_z_index, sigma_z_weights = _interpolate_between_nodes(log_sigma_z / GRID_NODE_SPACING)
+        ratio_index, ratio_weights = _interpolate_between_nodes(log_ratio / LN_SIGMA_NODE_SPACING)
+        sigma_z_index, sigma_z_weights = _interpolate_between_nodes(
+            log_sigma_z / LN_SIGMA_NODE_SPACING
+        )
         # Rows: ratios; columns: SIGMA_Z. Polynomial interpolation in both directions
         scores_at_nodes = [
             self._compute_scores_at_nodes(ratio_index + node, sigma_z_index)

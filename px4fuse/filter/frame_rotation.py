@@ -274,7 +274,7 @@ def _estimate_heading_error_from_positions(
             flight,
             time_s,
             position_samples.to_numpy() @ np.array([[cosine, -sine], [sine, cosine]]),
-            directions=np.eye(3)[:2],
+            axis_directions=np.eye(3)[:2],
             dt_s=dt_s,
             motion_cache=motion_cache,
             heading_sigma_rad=HEADING_SIGMA_RAD,

@@ -265,10 +265,10 @@ def _fit_scale(design_matrix: DesignMatrix, is_skipped: BoolArray) -> Estimate:
     best_scale = tested_scales[centre_index] + float(np.clip(vertex_shift, -1.5, 1.5)) * grid_step
     centre_fit = fit_scale(centre_index)
     # The linearised rotation by θ (x - θ y, y + θ x) lengthens the acceleration by √(1 + θ²)
-    lengthening_factor = math.hypot(1.0, centre_fit.coefficients[FRAME_ROTATION_COLUMN])
+    rotation_scale = math.hypot(1.0, centre_fit.coefficients[FRAME_ROTATION_COLUMN])
     # σ from the curvature of -ln p, increased if the residuals are larger than expected
     return Estimate(
-        float(best_scale * lengthening_factor - 1.0),
+        float(best_scale * rotation_scale - 1.0),
         grid_step / math.sqrt(curvature) * max(centre_fit.residual_rms, 1.0),
     )
 

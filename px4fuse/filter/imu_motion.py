@@ -54,7 +54,7 @@ from .marginal_likelihood import (
     PositionsAndIncrements,
     subtract_smooth_path,
 )
-from .model import compute_continuous_process_noise_per_density
+from .model import compute_continuous_unit_density_process_noise
 from .signals import Segment, find_gap_free_spans
 
 # Prior σ (rad) of the errors of tilt and heading at the start of a segment
@@ -67,7 +67,7 @@ PRIOR_SIGMAS_OF_CONSTANT_ERRORS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1]
 HEADING_INDEX_IN_CONSTANT_ERRORS = 2
 # A gyro bias above this limit (rad/s; 5 σ of the prior) is subtracted from the gyro data before the
 # constant errors are fitted to the positions
-MAX_PRIOR_GYRO_BIAS_RAD_S = 0.02
+MAX_UNCORRECTED_GYRO_BIAS_RAD_S = 0.02
 # Maximum gyro bias (rad/s) that EKF2 can remove from its attitude: the maximum of EKF2_GYR_B_LIM
 MAX_REMOVED_GYRO_BIAS_RAD_S = 0.4
 # Maximum length (s) of a segment: attitude errors must stay small for the linearisation
@@ -139,7 +139,7 @@ class PositionsAndImuMotion:
         The variance of a measurement is SIGMA_Z² / weight.
     segment_edges : ndarray of int, shape (s + 1,)
         Index of the first measurement of each segment, then m.
-    directions : ndarray, shape (a, 3)
+    axis_directions : ndarray, shape (a, 3)
         Unit vectors of the axes in NED.
     dt_s : float
         DT, the interval for which SIGMA_A is defined.
@@ -152,7 +152,7 @@ class PositionsAndImuMotion:
     measurement_weights: Array
     segment_edges: IntArray
     segment_motions: tuple[SegmentMotion, ...]
-    directions: Array
+    axis_directions: Array
     dt_s: float
     imu_interval_s: float
     heading_sigma_rad: float = HEADING_SIGMA_RAD
@@ -186,7 +186,7 @@ class PositionsAndImuMotion:
         """
         interval_s = np.diff(self.time_s)
         process_noise_per_sigma_a_squared = self.dt_s * np.stack(
-            compute_continuous_process_noise_per_density(interval_s)
+            compute_continuous_unit_density_process_noise(interval_s)
         )
         prior_precision = np.zeros((len(self.time_s), 2))
         prior_precision[self.segment_edges[:-1]] = INITIAL_STATE_PRIOR_PRECISIONS
@@ -195,7 +195,7 @@ class PositionsAndImuMotion:
         # error
         column_count = 1 + len(PRIOR_SIGMAS_OF_CONSTANT_ERRORS)
         dp, dv = np.zeros(
-            (2, len(self.directions), len(time_offsets_s), column_count, len(interval_s))
+            (2, len(self.axis_directions), len(time_offsets_s), column_count, len(interval_s))
         )
         for begin, end, segment_motion in zip(
             self.segment_edges, self.segment_edges[1:], self.segment_motions, strict=False
@@ -205,7 +205,7 @@ class PositionsAndImuMotion:
             # then its derivatives with respect to the nine constant errors of attitude and IMU.
             # tensordot projects NED onto the axes, and swapaxes puts the time offsets second
             position, velocity = (
-                np.swapaxes(np.tensordot(self.directions, signal, 1), 1, 2)
+                np.swapaxes(np.tensordot(self.axis_directions, signal, 1), 1, 2)
                 for signal in segment_motion.interpolate(
                     measurement_time_s + time_offsets_s[:, None]
                 )
@@ -338,7 +338,7 @@ def compute_imu_motion(
     time_s: Array,
     measurement_m: Array,
     *,
-    directions: Array,
+    axis_directions: Array,
     dt_s: float,
     measurement_weights: Array | None = None,
     motion_cache: MotionCache | None = None,
@@ -397,7 +397,7 @@ def compute_imu_motion(
         np.ones(len(used_rows)) if measurement_weights is None else measurement_weights[used_rows],
         segment_edges,
         tuple(segment_motions),
-        directions,
+        axis_directions,
         dt_s,
         compute_median_interval_s(imu_time_s),
         heading_sigma_rad,
@@ -519,6 +519,6 @@ def _estimate_large_gyro_bias(
     )
     bias_rad_s = np.median(rotation_difference_rad / np.diff(attitude_time_s)[:, None], axis=0)
     is_bias_removed = (
-        MAX_PRIOR_GYRO_BIAS_RAD_S < np.abs(bias_rad_s).max() <= MAX_REMOVED_GYRO_BIAS_RAD_S
+        MAX_UNCORRECTED_GYRO_BIAS_RAD_S < np.abs(bias_rad_s).max() <= MAX_REMOVED_GYRO_BIAS_RAD_S
     )
     return bias_rad_s if is_bias_removed else np.zeros(3)

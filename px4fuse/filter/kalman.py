@@ -138,7 +138,7 @@ def _run_with_filterpy(
         np.stack([dt_s**2 / 2.0, dt_s], axis=1)[:, :, None],
         model.make_transition_matrix(dt_s),
         noise_density[:, None, None]
-        * model.make_symmetric_matrix(model.compute_process_noise_per_density(dt_s)),
+        * model.make_symmetric_matrix(model.compute_unit_density_process_noise(dt_s)),
     )
     for u, B, F, Q, measured_m in zip(*matrices, measurements_m, strict=True):
         kalman.predict(u=u, B=B, F=F, Q=Q)

@@ -19,7 +19,7 @@ from px4fuse.core.arrays import Array, ArrayPair, BoolArray
 from .model import (
     INITIAL_COVARIANCE,
     SymmetricElements,
-    compute_process_noise_per_density,
+    compute_unit_density_process_noise,
     propagate_covariance,
     propagate_state,
     update_step,
@@ -35,7 +35,7 @@ MAX_LOG_LIKELIHOOD_DROP = float(chdtri(1, 0.05)) / 2.0
 INITIAL_LOG_SIGMA_SEARCH_STEP = 0.05
 # For each tested SIGMA_A, the most likely SIGMA_Z is searched, or vice versa. In this search, ln
 # SIGMA_Z changes at most by this value from the result for the previous tested SIGMA_A
-MAX_OTHER_NOISE_LOG_SIGMA_CHANGE = 1.0
+MAX_PROFILED_LOG_SIGMA_CHANGE = 1.0
 # Tolerance of ln σ in the search for the most likely SIGMA_Z for a given SIGMA_A, or vice versa
 OTHER_NOISE_LOG_SIGMA_TOLERANCE = 2e-3
 
@@ -79,7 +79,7 @@ def preintegrate(axis: Axis, settings: Settings) -> PreintegratedMotion:
     # Covariance at the end of the interval due to the acceleration noise in one step
     process_noise_per_sigma_a_squared = settings.dt_s * np.stack(
         propagate_covariance(
-            compute_process_noise_per_density(np.diff(step_times_s)),
+            compute_unit_density_process_noise(np.diff(step_times_s)),
             prediction_steps.compute_time_to_interval_end_s(),
         ),
         1,
@@ -286,8 +286,8 @@ def find_profile_likelihood_interval(
                     best_log_sigmas[0] + direction * change, tested_other_log_sigma
                 ),
                 bounds=(
-                    other_log_sigma - MAX_OTHER_NOISE_LOG_SIGMA_CHANGE,
-                    other_log_sigma + MAX_OTHER_NOISE_LOG_SIGMA_CHANGE,
+                    other_log_sigma - MAX_PROFILED_LOG_SIGMA_CHANGE,
+                    other_log_sigma + MAX_PROFILED_LOG_SIGMA_CHANGE,
                 ),
                 options={"xatol": OTHER_NOISE_LOG_SIGMA_TOLERANCE},
             )

@@ -427,21 +427,26 @@ def compute_segment_inner_products(
     )
     inner_products_by_batch = []
     for begin in range(0, right_factor_positions_m.shape[1], INNER_PRODUCTS_PER_BATCH):
-        batch = np.s_[:, begin : begin + INNER_PRODUCTS_PER_BATCH]
+        batch_slice = np.s_[:, begin : begin + INNER_PRODUCTS_PER_BATCH]
         # Inputs of the regression: each u, each v with zero increments, and the derivative for each
         # constant error with zero positions
         dp, dv = (
             np.concatenate(
-                [increment[batch], 0.0 * increment[batch], increment_per_constant_error], axis=1
+                [
+                    increment[batch_slice],
+                    0.0 * increment[batch_slice],
+                    increment_per_constant_error,
+                ],
+                axis=1,
             )[:, None]
             for increment, increment_per_constant_error in zip(
                 increments, increments_per_constant_error, strict=True
             )
         )
-        count = left_factor_positions_m[batch].shape[1]
+        count = left_factor_positions_m[batch_slice].shape[1]
         left, right, errors = slice(count), slice(count, 2 * count), slice(2 * count, None)
         left_and_right_factor_positions_m = np.concatenate(
-            [left_factor_positions_m[batch], right_factor_positions_m[batch]], axis=1
+            [left_factor_positions_m[batch_slice], right_factor_positions_m[batch_slice]], axis=1
         )[:, None]
         # Inner products of all pairs of inputs, (segments, inputs, inputs). Only those of each u
         # with its v are returned: the diagonal

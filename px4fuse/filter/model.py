@@ -40,12 +40,12 @@ def make_transition_matrix(dt_s: float | Array) -> Array:
     return build_matrix((1.0, dt_s), (0.0, 1.0))
 
 
-def compute_process_noise_per_density(dt_s: T) -> SymmetricElements[T]:
+def compute_unit_density_process_noise(dt_s: T) -> SymmetricElements[T]:
     """Return Q / (SIGMA_A² · DT) of one prediction step of length ``dt_s``: elements 00, 01, 11."""
     return dt_s**3 / 4.0, dt_s**2 / 2.0, dt_s
 
 
-def compute_continuous_process_noise_per_density(dt_s: T) -> SymmetricElements[T]:
+def compute_continuous_unit_density_process_noise(dt_s: T) -> SymmetricElements[T]:
     """Return Q / (SIGMA_A² · DT) of continuous white acceleration noise: elements 00, 01, 11."""
     return dt_s**3 / 3.0, dt_s**2 / 2.0, dt_s
 
@@ -75,7 +75,7 @@ def predict_step(
     ``noise_density`` (m²/s³) is (SIGMA_A² + acceleration variance in IMU gaps) · DT.
     """
     p00, p01, p11 = propagate_covariance(covariance, dt_s)
-    q00, q01, q11 = compute_process_noise_per_density(dt_s)
+    q00, q01, q11 = compute_unit_density_process_noise(dt_s)
     predicted_covariance = (
         p00 + noise_density * q00,
         p01 + noise_density * q01,

@@ -184,7 +184,7 @@ def compute_ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     return pd.DataFrame(acceleration, imu.index, list(AXIS_NAMES), copy=False)
 
 
-def estimate_aisle_heading(track: PositionTrack, segment: Segment) -> tuple[float, float]:
+def estimate_main_heading(track: PositionTrack, segment: Segment) -> tuple[float, float]:
     """Return the main horizontal direction of the positions.
 
     Returns
@@ -320,7 +320,7 @@ def _choose_axis_direction(
         return np.eye(3)[axis_index], (None if name == "down" else 90.0 * axis_index), ""
     note = HEADING_NOTE
     if heading_deg is None:
-        heading_deg, elongation = estimate_aisle_heading(track, segment)
+        heading_deg, elongation = estimate_main_heading(track, segment)
         note = f"main direction of the track (ratio of length to width: {elongation:.1f})"
     angle_rad = np.radians(heading_deg)
     return np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0]), heading_deg, note

@@ -38,7 +38,7 @@ from .settings import Settings
 from .signals import Segment, cut_to_segment, make_downsampling_slice
 
 # Half-width (s) of the range of time offsets that is tested around the result of the coarse search
-INITIAL_SEARCH_HALF_WIDTH_S = 0.1
+INITIAL_OFFSET_HALF_WIDTH_S = 0.1
 # The likelihood curve shows the likelihood of the positions over the time offset. It covers the
 # estimated time offset ± this multiple of its σ, and at least ± this time (s)
 LIKELIHOOD_CURVE_HALF_WIDTH_SIGMAS, MIN_LIKELIHOOD_CURVE_HALF_WIDTH_S = 3.5, 0.01
@@ -74,7 +74,7 @@ MIN_TIME_OFFSET_S = 0.03
 # The effect of IMU noise on the time offset is simulated for groups of successive flight segments.
 # Minimum number of simulated groups (a short flight is simulated several times), and segments in
 # each group
-SIMULATED_SEGMENT_GROUP_COUNT, FLIGHT_SEGMENTS_PER_SIMULATED_GROUP = 96, 12
+IMU_NOISE_SIMULATION_COUNT, SEGMENTS_PER_NOISE_SIMULATION = 96, 12
 
 
 class FlightPartTimeOffset(Record):
@@ -185,7 +185,7 @@ def estimate_time_offset(
         flight,
         position_samples.index.to_numpy(),
         position_samples.to_numpy(),
-        directions=np.eye(3)[:axis_count],
+        axis_directions=np.eye(3)[:axis_count],
         dt_s=settings.dt_s,
         motion_cache=motion_cache,
         heading_sigma_rad=GNSS_HEADING_SIGMA_RAD if track.origin.is_gnss else HEADING_SIGMA_RAD,
@@ -197,7 +197,7 @@ def estimate_time_offset(
     progress("time offset")
     downsampled_motion = imu_motion.downsample(COARSE_SEARCH_MEASUREMENT_COUNT)
     offset_s, _ = imu_motion.search_time_offset(noise_parameters)
-    search_half_width_s = INITIAL_SEARCH_HALF_WIDTH_S
+    search_half_width_s = INITIAL_OFFSET_HALF_WIDTH_S
     for motion in (downsampled_motion, imu_motion):
         noise_parameters = motion.fit_noises(offset_s, noise_parameters).noise_parameters
         tested_offsets_s = _make_offset_grid(offset_s, search_half_width_s, FINE_GRID_OFFSET_COUNT)
@@ -224,8 +224,8 @@ def estimate_time_offset(
     offset_s = _fit_minimum_and_sigma(curve.offsets_s, curve.scores)[0]
     # An IMU sample is an average over its interval, so its time has an error of half an interval (1
     # σ). The 95 % interval of the time offset is widened by this error
-    resolution_s = 0.5 * imu_motion.imu_interval_s
-    interval_low_s, interval_high_s = curve.widen_interval(offset_s, 1.96 * resolution_s)
+    offset_resolution_s = 0.5 * imu_motion.imu_interval_s
+    interval_low_s, interval_high_s = curve.widen_interval(offset_s, 1.96 * offset_resolution_s)
     rejection_reason = ""
     if (
         None in (curve.low_s, curve.high_s)
@@ -250,7 +250,9 @@ def estimate_time_offset(
         offset_s=applied_offset_s + offset_s,
         interval_s=(applied_offset_s + interval_low_s, applied_offset_s + interval_high_s),
         applied_s=applied_offset_s,
-        sigma_s=float(np.hypot(offset_sigma_s * np.sqrt(offset_variance_factor), resolution_s)),
+        sigma_s=float(
+            np.hypot(offset_sigma_s * np.sqrt(offset_variance_factor), offset_resolution_s)
+        ),
         is_determinable=not rejection_reason,
         reason=rejection_reason,
         likelihood_curve_offsets_s=applied_offset_s + curve.offsets_s,
@@ -353,13 +355,13 @@ def _simulate_variance_increase_by_imu_noise(
     positions_at_offset = imu_motion.make_positions_at_offset(offset_s)
     is_within_segment = positions_at_offset.is_within_segment
     measurement_count = len(imu_motion.time_s)
-    axis_count = len(imu_motion.directions)
+    axis_count = len(imu_motion.axis_directions)
 
     rng = np.random.default_rng(measurement_count)
     first_segment_of_each_group = np.arange(
-        0, len(imu_motion.segment_motions), FLIGHT_SEGMENTS_PER_SIMULATED_GROUP
+        0, len(imu_motion.segment_motions), SEGMENTS_PER_NOISE_SIMULATION
     )
-    noise_series_count = -(-SIMULATED_SEGMENT_GROUP_COUNT // len(first_segment_of_each_group))
+    noise_series_count = -(-IMU_NOISE_SIMULATION_COUNT // len(first_segment_of_each_group))
 
     def draw_normal(count: int) -> Array:
         return rng.standard_normal((count, axis_count, noise_series_count)).transpose(1, 2, 0)

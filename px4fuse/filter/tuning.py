@@ -324,7 +324,7 @@ def _fit_with_imu_motion(
         flight,
         axes[0].measurement_time_s,
         measured_m,
-        directions=np.array([axis.direction for axis in axes]),
+        axis_directions=np.array([axis.direction for axis in axes]),
         dt_s=settings.dt_s,
         measurement_weights=measurement_weights,
         motion_cache=motion_cache,

@@ -268,9 +268,9 @@ def detect_parameter_changes(analysis: Analysis) -> Findings:
         )
 
 
-def _differ_by_min_factor(before: float, after: float) -> bool:
+def _differ_by_min_factor(value_before: float, value_after: float) -> bool:
     """Return True if both values are known and differ by more than the minimum factor."""
-    low, high = sorted((before, after))
+    low, high = sorted((value_before, value_after))
     return low > 0.0 and high > MIN_SIGMA_RATIO_OR_RMSE_CHANGE_FACTOR * low
 
 

@@ -65,7 +65,7 @@ MIN_GYRO_BIAS_RAD_S = 0.05
 # gravity by more than this value (m/s²), the message states the specific force
 MIN_GRAVITY_ERROR_M_S2 = 0.3
 # Maximum fraction of the flight in which EKF2's tilt or heading is not aligned, without a finding
-MAX_UNALIGNED_FRACTION = 0.02
+MAX_UNALIGNED_ATTITUDE_FRACTION = 0.02
 # Maximum time (s) from EKF2's tilt alignment to its heading alignment, without a finding
 MAX_HEADING_ALIGNMENT_DELAY_S = 5.0
 # Height resets of EKF2 up to this time (s) after take-off are normal
@@ -211,7 +211,7 @@ def detect_missing_alignment(
         spans = find_spans_with_value(0.0, ekf2.status_flags[flag], segment)
         unaligned_fraction = 1.0 - compute_flag_fraction(ekf2.status_flags[flag], segment)
         if (
-            unaligned_fraction > MAX_UNALIGNED_FRACTION
+            unaligned_fraction > MAX_UNALIGNED_ATTITUDE_FRACTION
             and spans[-1][1] > alignment_end_s + MAX_HEADING_ALIGNMENT_DELAY_S
         ):
             alignment_end_s = spans[-1][1]
@@ -265,7 +265,7 @@ def detect_resets(analysis: Analysis, ekf2: Ekf2) -> Findings:
         horizontal_resets = [reset for reset in position_resets if any(reset.delta[:2])]
         resets = horizontal_resets or position_resets
         # True if each reset follows a gap in the positions
-        follows_gap = all(
+        resets_follow_gaps = all(
             any(
                 start <= reset.time_s <= end + MAX_RESET_DELAY_S
                 for start, end in analysis.events.gaps
@@ -273,19 +273,19 @@ def detect_resets(analysis: Analysis, ekf2: Ekf2) -> Findings:
             for reset in resets
         )
         largest_reset = max(resets, key=lambda reset: math.hypot(*reset.delta))
-        largest_m, time_s = math.hypot(*largest_reset.delta), largest_reset.time_s
+        largest_reset_m, time_s = math.hypot(*largest_reset.delta), largest_reset.time_s
         yield finding(
             "warning" if horizontal_resets else "note",
             "ekf2_resets",
             f"EKF2 reset its {'horizontal position' if horizontal_resets else 'height'} "
-            f"{format_occurrences(len(resets))} (largest reset: {largest_m:.2f} m at {time_s:.1f} "
-            "s).",
+            f"{format_occurrences(len(resets))} (largest reset: {largest_reset_m:.2f} m at "
+            f"{time_s:.1f} s).",
             f"Run px4fuse explore LOG and compare position and innovation at {time_s:.1f} s.",
             {
                 "count": len(resets),
-                "largest_m": largest_m,
+                "largest_m": largest_reset_m,
                 "at_s": time_s,
-                CAUSE_KEY: SOURCE_GAP_CAUSE if follows_gap else UNKNOWN_CAUSE,
+                CAUSE_KEY: SOURCE_GAP_CAUSE if resets_follow_gaps else UNKNOWN_CAUSE,
             },
             make_zero_length_spans(reset.time_s for reset in resets),
         )

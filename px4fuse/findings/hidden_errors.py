@@ -139,16 +139,16 @@ def make_hidden_error_finding(
     is_misaligned = False
     rmse_text = f"position RMSE {format_metres(worst_error.rmse_m)} m against ground truth"
     if cause is None and (alignment_rmse := _compute_alignment_rmse(analysis, worst_filter)):
-        before_m, after_m = alignment_rmse
+        unaligned_rmse_m, aligned_rmse_m = alignment_rmse
         rmse_text = (
-            f"horizontal position RMSE {format_metres(before_m)} m before and "
-            f"{format_metres(after_m)} m after alignment (shift and rotation)"
+            f"horizontal position RMSE {format_metres(unaligned_rmse_m)} m before and "
+            f"{format_metres(aligned_rmse_m)} m after alignment (shift and rotation)"
         )
         evidence |= {
-            "position_rmse_horizontal_m": before_m,
-            "position_rmse_aligned_m": after_m,
+            "position_rmse_horizontal_m": unaligned_rmse_m,
+            "position_rmse_aligned_m": aligned_rmse_m,
         }
-        is_misaligned = after_m < MAX_ALIGNED_TO_UNALIGNED_RMSE_RATIO * before_m
+        is_misaligned = aligned_rmse_m < MAX_ALIGNED_TO_UNALIGNED_RMSE_RATIO * unaligned_rmse_m
     # 4. Remedy, in the order of certainty
     kf_errors = analysis.axes[worst_axis].filters["kf"].truth
     if cause is not None:
@@ -201,7 +201,7 @@ def _make_drift_finding(
     # State the closure error first if it shows the drift: true end known, path from odometry
     if (
         loop is not None
-        and not (loop.is_end_assumed or loop.is_absolute_track)
+        and not (loop.is_landing_place_assumed or loop.is_absolute_track)
         and not isinstance(loop.true_end, Unavailable)
         and (closure_error_m := loop.closure_error_m) is not None
     ):
@@ -246,11 +246,11 @@ def _compute_alignment_rmse(
         aligned_position_m = fit_alignment(position_m, true_position_m, "yaw").apply(position_m)
     except TrajectoryError:  # the track is too short to determine a rotation
         return None
-    before_m, after_m = (
+    unaligned_rmse_m, aligned_rmse_m = (
         float(np.linalg.norm(estimate_m - true_position_m)) / len(true_position_m) ** 0.5
         for estimate_m in (position_m, aligned_position_m)
     )
-    return before_m, after_m
+    return unaligned_rmse_m, aligned_rmse_m
 
 
 def make_possible_drift_finding(analysis: Analysis) -> Finding:

@@ -43,7 +43,7 @@ def detect_loop_faults(loop: Loop) -> Findings:
             "Loop closures need odometry: send visual-inertial odometry to PX4 as ODOMETRY.",
             evidence,
         )
-    if evidence and loop.is_end_assumed:
+    if evidence and loop.is_landing_place_assumed:
         yield make_note(
             "loop_landing_assumed",
             "The landing place is unknown, so px4fuse assumes the take-off place. The loop closure "
@@ -69,7 +69,7 @@ def detect_inconsistent_closures(loop: Loop) -> Findings:
         )
     for closure, weight in zip(loop.closures, weights, strict=True):
         if not closure.accepted:
-            yield _make_false_closure_finding(closure, loop.is_end_assumed)
+            yield _make_false_closure_finding(closure, loop.is_landing_place_assumed)
         elif weight < MIN_GNC_WEIGHT and not are_most_closures_rejected:
             yield make_warning(
                 "loop_closure_inconsistent",
@@ -80,10 +80,10 @@ def detect_inconsistent_closures(loop: Loop) -> Findings:
             )
 
 
-def _make_false_closure_finding(closure: LoopClosure, is_end_assumed: bool) -> Finding:
+def _make_false_closure_finding(closure: LoopClosure, is_landing_place_assumed: bool) -> Finding:
     is_landing = closure.source == LANDING_CLOSURE_SOURCE
     closure_text = str(closure)
-    if is_landing and is_end_assumed:
+    if is_landing and is_landing_place_assumed:
         closure_text = "the landing place is not the take-off place"
     action = "Remove this loop closure. In this run, px4fuse already ignores it."
     if is_landing:

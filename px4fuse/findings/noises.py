@@ -146,10 +146,10 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
     # SIGMA_Z and SIGMA_A are estimated together: the more severe finding (or, of equal severity,
     # the larger deviation) is the cause of the other
     findings.sort(key=lambda item: (SEVERITIES.index(item[1].severity), -item[0]))
-    cause = None
+    cause_id = None
     for _, setting_finding in findings:
-        yield structs.replace(setting_finding, caused_by=cause)
-        cause = cause or setting_finding.id
+        yield structs.replace(setting_finding, caused_by=cause_id)
+        cause_id = cause_id or setting_finding.id
 
 
 def _make_setting_finding(

@@ -114,18 +114,18 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     noise = analysis.time_correlated_noise
     if (
         not isinstance(noise, TimeCorrelatedNoise)
-        or noise.gain_nats < MIN_CORRELATED_NOISE_LOG_LIKELIHOOD_RATIO_NATS
+        or noise.likelihood_gain_nats < MIN_CORRELATED_NOISE_LOG_LIKELIHOOD_RATIO_NATS
         or noise.slow_m < MIN_CORRELATED_NOISE_SIGMA_M
         # A low-pass filter explains the correlated position errors: source_positions.py reports it
-        or noise.low_pass_gain_nats >= MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS
+        or noise.low_pass_likelihood_gain_nats >= MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS
     ):
         return
-    time_text = f"at least {format_number(noise.low_s, 1)} s (95 %)"
+    correlation_time_text = f"at least {format_number(noise.low_s, 1)} s (95 %)"
     if np.isfinite(noise.high_s):
         tau_text, low_text, high_text = (
             format_number(time_s, 1) for time_s in (noise.tau_s, noise.low_s, noise.high_s)
         )
-        time_text = f"{tau_text} s (95 % {low_text} to {high_text} s)"
+        correlation_time_text = f"{tau_text} s (95 % {low_text} to {high_text} s)"
     evidence = {name: value for name, value in asdict(noise).items() if np.isfinite(value)}
     ekf2_noises_m = map(find_ekf2_noise_m, analysis.axes.values())
     assumed_noise_m = float(np.nanmin([analysis.settings.sigma_z_m, *ekf2_noises_m]))
@@ -140,7 +140,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     yield (make_note if is_normal else make_warning)(
         "source_noise_time_correlated",
         f"Time-correlated {analysis.source.kind_name} error of {noise.slow_m:.2g} m, "
-        f"correlation time {time_text}. The remaining error is white noise of "
+        f"correlation time {correlation_time_text}. The remaining error is white noise of "
         f"{noise.white_m:.2g} m (1 σ). KF and EKF2 assume independent errors: both follow the "
         "correlated error, and their σ is too small.",
         f"{find_source_texts(analysis).slow_error_check}.",

@@ -39,7 +39,7 @@ from .model import (
 # Minimum fraction of lost positions for a finding: PX4 v1.14 and later loses 0.3 %
 MIN_LOST_POSITION_FRACTION = 0.02
 # Minimum number of intervals between positions to detect downsampling
-MIN_INTERVAL_COUNT = 50
+MIN_INTERVALS_FOR_DOWNSAMPLING = 50
 # Minimum fraction of missing positions to report downsampling: a radio link loses fewer
 MIN_MISSING_FRACTION_FOR_DOWNSAMPLING = 0.25
 # Downsampling gives intervals between positions of two lengths: n or n + 1 periods of the source.
@@ -288,7 +288,7 @@ def detect_downsampling(analysis: Analysis) -> Findings:
     ):
         return
     intervals_s, _ = _compute_intervals_s(analysis)
-    if len(intervals_s) < MIN_INTERVAL_COUNT:
+    if len(intervals_s) < MIN_INTERVALS_FOR_DOWNSAMPLING:
         return
     period_and_multiples = _find_period(intervals_s)
     if period_and_multiples is None:

@@ -159,7 +159,7 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     # A low-pass filter must fit better than white noise, and have a relevant lag
     if (
         isinstance(low_pass, Unavailable)
-        or low_pass.gain_nats < MIN_LOW_PASS_LOG_LIKELIHOOD_RATIO_NATS
+        or low_pass.likelihood_gain_nats < MIN_LOW_PASS_LOG_LIKELIHOOD_RATIO_NATS
         or low_pass.lag_s < MIN_FILTER_LAG_S
     ):
         return None
@@ -168,7 +168,7 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     # it fits better than time-correlated noise
     if (
         isinstance(correlated_noise, TimeCorrelatedNoise)
-        and correlated_noise.low_pass_gain_nats < MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS
+        and correlated_noise.low_pass_likelihood_gain_nats < MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS
     ):
         return None
     # At a high position rate, the lag estimated from the correlation of the noise is inaccurate:
@@ -232,12 +232,12 @@ def detect_jumps(analysis: Analysis) -> Findings:
     if len(jumps) > 1:
         jump_text = f"jump {len(jumps)} times, by up to {size_m:.2f} m"
     total_step_m = np.sum([[step.value for step in jump.step_m] for jump in jumps], axis=0)
-    has_returned_after_jumps = np.linalg.norm(total_step_m) < MIN_JUMP_M
+    is_jump_sum_small = np.linalg.norm(total_step_m) < MIN_JUMP_M
     yield finding(
         error_if(size_m >= MIN_JUMP_FOR_SEVERITY_ERROR_M),
         "source_position_jump",
         f"{analysis.source.positions_text} {jump_text} at {time_s:.1f} s and "
-        f"{'return afterwards' if has_returned_after_jumps else 'stay there'}. The IMU does not "
+        f"{'return afterwards' if is_jump_sum_small else 'stay there'}. The IMU does not "
         "measure this motion "
         f"(± {1.96 * sigma_m:.2f} m, 95 %). {cause} KF and EKF2 follow the jump with consistent "
         "innovations.",
@@ -428,7 +428,7 @@ def detect_scale_error(analysis: Analysis) -> Findings:
 
 
 def make_scale_finding(
-    source: PositionTrack, scale_error: float, sigma: float, reference: str, action: str
+    source: PositionTrack, scale_error: float, sigma: float, reference: str, remedy: str
 ) -> Finding:
     """Make the finding on a scale factor error of the positions.
 
@@ -441,7 +441,7 @@ def make_scale_finding(
         f"{source.kind_name} distances are {format_percent(abs(scale_error))} too "
         f"{'long' if scale_error > 0.0 else 'short'}. The scale is estimated from {reference}. "
         "Innovations do not show a scale factor error.",
-        action,
+        remedy,
         {"scale": 1.0 + scale_error, "sigma": sigma},
     )
 

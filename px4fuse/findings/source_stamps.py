@@ -12,7 +12,7 @@ from px4fuse.ekf2.fusion_conditions import EFFECT_BY_UNUSABLE_TIMESTAMP, find_ti
 from px4fuse.ekf2.intervals import MAX_DELAY_BEHIND_HORIZON_S
 from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import (
-    METHODS_WITHOUT_MEASUREMENT_TIMES,
+    CLOCK_METHODS_WITHOUT_MEASUREMENT_TIMES,
     REPEATED_TIMESTAMPS_NOTE,
     ClockConversion,
     Ekf2,
@@ -74,7 +74,7 @@ def detect(analysis: Analysis) -> Findings:
         yield from detect_wrong_timestamp_unit_or_clock(analysis, clock_map.clock)
     elif clock_map.distinct_stamps is not None:
         yield from detect_constant_timestamps(positions_text, clock_map, clock_map.distinct_stamps)
-    elif clock_map.method in METHODS_WITHOUT_MEASUREMENT_TIMES:
+    elif clock_map.method in CLOCK_METHODS_WITHOUT_MEASUREMENT_TIMES:
         kf_times_sentence = (
             f"KF uses the message timestamps, converted to boot time with the {clock_map.method}."
         )
@@ -275,14 +275,17 @@ def find_timesync_convergence(analysis: Analysis) -> tuple[float, float] | None:
     is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_TO_PUBLICATION_DELAY_S).to_numpy()
     # TIMESYNC converged where most earlier and fewest later timestamps are arrival times
     converged_index = int(np.argmax(np.cumsum(np.where(is_arrival_time, 1, -1)))) + 1
-    is_arrival_time_in_first_part, is_arrival_time_in_second_part = np.split(
+    is_arrival_time_before_convergence, is_arrival_time_after_convergence = np.split(
         is_arrival_time, [converged_index]
     )
     if (
         is_arrival_time.mean() >= MIN_FRACTION_OF_EXPECTED_TIMESTAMP_KIND
-        or min(len(is_arrival_time_in_first_part), len(is_arrival_time_in_second_part))
+        or min(len(is_arrival_time_before_convergence), len(is_arrival_time_after_convergence))
         < MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC
-        or min(is_arrival_time_in_first_part.mean(), 1.0 - is_arrival_time_in_second_part.mean())
+        or min(
+            is_arrival_time_before_convergence.mean(),
+            1.0 - is_arrival_time_after_convergence.mean(),
+        )
         < MIN_FRACTION_OF_EXPECTED_TIMESTAMP_KIND
     ):
         return None

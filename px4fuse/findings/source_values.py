@@ -289,8 +289,10 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     window_medians_m = np.median(deviation_windows_m, axis=1)
     # A lost sample exchanges the senders, so the medians of all later windows have the opposite
     # sign. Invert the medians that point away from the largest median
-    largest_median_m = window_medians_m[np.argmax(np.linalg.norm(window_medians_m, axis=1))]
-    window_medians_m[window_medians_m @ largest_median_m < 0.0] *= -1.0
+    largest_median_deviation_m = window_medians_m[
+        np.argmax(np.linalg.norm(window_medians_m, axis=1))
+    ]
+    window_medians_m[window_medians_m @ largest_median_deviation_m < 0.0] *= -1.0
     difference_between_senders_m = np.median(window_medians_m, axis=0)
     # σ from the median absolute deviation
     scatter_m = (

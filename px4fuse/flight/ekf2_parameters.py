@@ -161,16 +161,16 @@ def fill_parameters_with_defaults(
     """
     # One parameter enables all aiding sources of a sensor, such as GNSS position and velocity
     used_switches = {fused_aid.switch for fused_aid in (aid, *other_aids)}
-    excluded_names: set[str] = set()
+    excluded_parameter_names: set[str] = set()
     for other_aid in (EV_POS, GNSS_POS, GNSS_VEL, MAG, BAROMETER):
         if other_aid.switch not in used_switches:
-            excluded_names.update(other_aid.measurement_parameters, other_aid.lever_arm)
+            excluded_parameter_names.update(other_aid.measurement_parameters, other_aid.lever_arm)
     if MAG.switch not in used_switches:
-        excluded_names.update(MAGNETIC_FIELD_NOISE_PARAMETERS)
+        excluded_parameter_names.update(MAGNETIC_FIELD_NOISE_PARAMETERS)
     defaults = {
         name: parameter.default
         for name, parameter in MODEL_PARAMETERS.items()
-        if name not in excluded_names
+        if name not in excluded_parameter_names
     }
     # These are parameters of external vision only
     if uses_aid_mask(logged_values) and aid == EV_POS:

@@ -294,7 +294,7 @@ Spans = tuple[Span, ...]
 # Minimum fraction of regular sample intervals; with fewer, the samples arrive in bursts
 MIN_REGULAR_INTERVAL_FRACTION = 0.8
 # Methods of clock conversion that do not give measurement times
-METHODS_WITHOUT_MEASUREMENT_TIMES = ("arrival time", "receive time", "message order")
+CLOCK_METHODS_WITHOUT_MEASUREMENT_TIMES = ("arrival time", "receive time", "message order")
 HEIGHT_ONLY_REASON = "x and y are NaN in all messages, so the source measures only the height"
 # Ratio of the median absolute second difference to the σ of white noise
 MEDIAN_ABS_SECOND_DIFFERENCE_PER_SIGMA = 6.0**0.5 / 1.4826

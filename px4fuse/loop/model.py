@@ -22,7 +22,7 @@ from px4fuse.finding import Finding
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution
-from px4fuse.trajectory.model import AxisComponents, Frame, Trajectory, TrajectoryKind
+from px4fuse.trajectory.model import Frame, Trajectory, TrajectoryKind, VectorComponents
 
 # Names of the uncorrected path and of the corrected paths. "by_distance" distributes the closure
 # errors of position and heading in proportion to the distance flown, "by_distance_plain" only that
@@ -55,7 +55,7 @@ class TrueFinalPose(Record, kw_only=True):
         True if the landing place is assumed to be the take-off place.
     """
 
-    displacement_m: AxisComponents
+    displacement_m: VectorComponents
     heading_change_deg: float | None = None
     sigma_m: NonNegativeFloat
     sigma_heading_deg: NonNegativeFloat | None = None
@@ -158,12 +158,12 @@ class Loop(Record, kw_only=True):
     key_frames: Count
     key_frame_spacing_m: NonNegativeFloat
     path_length_m: NonNegativeFloat
-    end_from_start_m: AxisComponents
+    end_from_start_m: VectorComponents
     heading_change_deg: float | None = None
     true_end: OrUnavailable[TrueFinalPose]
     closure_error_m: NonNegativeFloat | None = None
     closure_percent: NonNegativeFloat | None = None
-    closure_error_axes_m: AxisComponents | None = None
+    closure_error_axes_m: VectorComponents | None = None
     heading_error_deg: float | Unavailable
     is_absolute_track: bool
     odometry_noise: OdometryNoise
@@ -207,7 +207,7 @@ class Loop(Record, kw_only=True):
         return paths.get("pose_graph_gated") or paths.get("by_distance") or paths["uncorrected"]
 
     @property
-    def is_end_assumed(self) -> bool:
+    def is_landing_place_assumed(self) -> bool:
         """True if the landing place is assumed to be the take-off place."""
         return isinstance(self.true_end, TrueFinalPose) and self.true_end.assumed
 

@@ -26,7 +26,7 @@ MAX_IMU_READING = 1e4
 MIN_DISTANCE_OF_INVALID_ZERO_POSITION_M = 0.3
 # A position is damaged if its distance (m) from the median position exceeds this limit and the
 # following multiple of the median distance
-MIN_DAMAGED_DISTANCE_M = 1e4
+MIN_DAMAGED_POSITION_DISTANCE_M = 1e4
 # A damaged position is farther from the median position than this multiple of the median distance
 MIN_DAMAGED_TO_MEDIAN_DISTANCE_RATIO = 100.0
 # Minimum duration (s) of equal positions that are rejected as frozen
@@ -188,7 +188,7 @@ def classify_invalid_positions(samples: pd.DataFrame, columns: list[str]) -> "pd
     offset_from_median_m = values[valid_rows] - np.median(values[valid_rows], axis=0)
     distance_m = np.linalg.norm(offset_from_median_m, axis=1)
     is_far_from_median = distance_m > max(
-        MIN_DAMAGED_DISTANCE_M,
+        MIN_DAMAGED_POSITION_DISTANCE_M,
         MIN_DAMAGED_TO_MEDIAN_DISTANCE_RATIO * np.median(distance_m),
     )
     reason_by_row.iloc[valid_rows[is_far_from_median]] = "far"

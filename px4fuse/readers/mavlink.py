@@ -58,7 +58,7 @@ from .mavlink_recording import (
     read_recording,
 )
 from .px4_positions import barometer
-from .ulog_topics import NO_INSTANCE_SWITCHES, describe_dropped_samples
+from .ulog_topics import NO_EKF2_INSTANCE_SWITCHES, describe_dropped_samples
 
 VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
 # Maximum fraction of bytes outside MAVLink frames in an undamaged file
@@ -96,11 +96,11 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
     positions, unavailable_positions = read_positions(recording, clock_conversions, gnss_delay_s)
     truth = read_truth(recording, positions)
     airborne_spans_s = _read_airborne_spans(recording)
-    is_in_flight = common.ends_in_flight(airborne_spans_s, recording.duration_s)
+    ends_in_flight = common.ends_in_flight(airborne_spans_s, recording.duration_s)
     pressure_hpa = recording.read(MESSAGE_LAYOUTS["SCALED_PRESSURE"])["pressure_hpa"]
     return Flight(
         # Called after the readers, because the description counts the samples that they dropped
-        log=_describe_log(recording, parameters, replaced_parameter_notes, is_in_flight),
+        log=_describe_log(recording, parameters, replaced_parameter_notes, ends_in_flight),
         imu=imu,
         attitude=attitude,
         positions=positions,
@@ -109,7 +109,7 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
         airborne=airborne_spans_s,
         barometer=barometer(compute_pressure_altitude_m(pressure_hpa)),
         missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *unavailable_positions),
-        streams=recording.data_source_by_kind,
+        streams=recording.data_source_by_data_kind,
         clocks=senders.describe_clock_conversions(recording, clock_conversions),
         unused=tuple(
             UnusedData(name, count, reason)
@@ -137,7 +137,7 @@ def _read_imu(recording: Recording) -> TableOrUnavailable:
             "the recording contains no usable HIGHRES_IMU or SCALED_IMU",
             recording.remedies["imu"],
         )
-    recording.record_stream("imu", layout.topic)
+    recording.record_data_source("imu", layout.topic)
     return imu
 
 
@@ -149,7 +149,7 @@ def _read_attitude(recording: Recording) -> TableOrUnavailable:
         return Unavailable(
             "attitude", f"the recording contains no usable {names}", recording.remedies["attitude"]
         )
-    recording.record_stream("attitude", layout.topic)
+    recording.record_data_source("attitude", layout.topic)
     return attitude
 
 
@@ -167,7 +167,7 @@ def _read_ekf2(recording: Recording, parameters: Mapping[str, float]) -> Ekf2 | 
         return Unavailable(
             "EKF2", "the autopilot sent no usable ODOMETRY or LOCAL_POSITION_NED", remedies["state"]
         )
-    recording.record_stream("ekf2_state", message_name)
+    recording.record_data_source("ekf2_state", message_name)
     notes = [f"the EKF2 state is from the autopilot's {message_name} messages"]
     if autopilot != "PX4":
         notes.append(f"in the results, EKF2 stands for the estimator of {autopilot}")
@@ -196,7 +196,7 @@ def _read_ekf2(recording: Recording, parameters: Mapping[str, float]) -> Ekf2 | 
             remedies["innovations"],
         ),
         resets=(),
-        primary_instances=NO_INSTANCE_SWITCHES,
+        primary_instances=NO_EKF2_INSTANCE_SWITCHES,
         gate=fill_parameters_with_defaults(parameters)[EV_POS.gate],
         notes=tuple(notes),
         record=ARDUPILOT_REPLAY_UNAVAILABLE if autopilot == "ArduPilot" else RECORD_NOT_LOGGED,
@@ -230,7 +230,7 @@ def _read_ekf2_variance(
             "EKF2's position variances are from ESTIMATOR_STATUS: pos_horiz_accuracy² / 2 "
             "along each horizontal axis. Velocity variances are not sent"
         )
-    recording.record_stream("ekf2_variance", message_name)
+    recording.record_data_source("ekf2_variance", message_name)
     return variance
 
 
@@ -243,7 +243,7 @@ def _read_airborne_spans(recording: Recording) -> Spans | Unavailable:
             "the recording contains no usable EXTENDED_SYS_STATE",
             recording.remedies["landed"],
         )
-    recording.record_stream("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK_TEXT)
+    recording.record_data_source("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK_TEXT)
     rows = recording.rows("EXTENDED_SYS_STATE")[is_known]
     time_s = recording.compute_receipt_boot_times_s(rows) - recording.time_origin_s
     is_airborne = pd.Series(landed_states[is_known] != ON_GROUND_STATE, time_s)
@@ -270,7 +270,7 @@ def _describe_log(
     recording: Recording,
     parameters: Mapping[str, float],
     replaced_parameter_notes: tuple[str, ...],
-    is_in_flight: bool,
+    ends_in_flight: bool,
 ) -> LogInfo:
     frames, autopilot = recording.frames, recording.autopilot
     notes, damage_notes = [*recording.notes], []
@@ -280,7 +280,7 @@ def _describe_log(
             f"{frames.unknown_frame_count}"
         )
     if frames.is_last_frame_incomplete:
-        damage_notes.append(common.format_truncation("frame", recording.duration_s, is_in_flight))
+        damage_notes.append(common.format_truncation("frame", recording.duration_s, ends_in_flight))
     stray_byte_count, byte_count = frames.byte_count_outside_frames, len(frames.content)
     stray_bytes_note = (
         f"{stray_byte_count:,} bytes ({stray_byte_count / byte_count:.2%}) are not part of a "
@@ -327,7 +327,7 @@ def _describe_log(
         senders=senders.describe_senders(recording),
         vehicle=vehicle_id,
         damage=tuple(damage_notes),
-        ends_in_flight=is_in_flight,
+        ends_in_flight=ends_in_flight,
         bytes_read=byte_count - stray_byte_count,
     )
 

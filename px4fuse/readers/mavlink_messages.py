@@ -94,7 +94,7 @@ CONVERSION_BY_MAV_FRAME = {
 # Names of MAV_AUTOPILOT
 AUTOPILOT_NAME_BY_ID = {0: "generic autopilot", 3: "ArduPilot", 12: "PX4"}
 # Advice to the user for each kind of missing data, by autopilot
-REMEDIES: Mapping[str, Mapping[str, str]] = _MESSAGE_TABLES["remedies"]
+MISSING_DATA_REMEDIES: Mapping[str, Mapping[str, str]] = _MESSAGE_TABLES["remedies"]
 REASON_BY_UNUSED_MESSAGE: Mapping[str, str] = _MESSAGE_TABLES["unused"]
 POSITION_MESSAGE_TYPES = tuple(
     msgspec.convert({"track_name": name, **row}, PositionMessageType)

@@ -45,7 +45,7 @@ from .px4_positions import (
     find_motion_capture_truth,
     make_track,
     project_to_ned,
-    split_tracks,
+    separate_unavailable_tracks,
     unavailable_source,
     unproject,
 )
@@ -89,7 +89,7 @@ def read_positions(
         ]
     gnss_tracks = (_read_gnss(recording, layout, delay_s) for layout in GNSS_LAYOUTS)
     tracks_or_unavailable += [track for track in gnss_tracks if track]
-    return split_tracks(tracks_or_unavailable)
+    return separate_unavailable_tracks(tracks_or_unavailable)
 
 
 def _read_track(
@@ -161,15 +161,15 @@ def _read_gnss(
     message_count = len(rows)
     time_us = recording.frames.table(layout.topic, rows)["time_usec"]
     is_new = np.diff(time_us, prepend=0) > 0
-    rows, gnss_boot_time_s = rows[is_new], time_us[is_new] * 1e-6
+    rows, gnss_boot_clock_s = rows[is_new], time_us[is_new] * 1e-6
     receipt_boot_times_s = recording.compute_receipt_boot_times_s(rows)
     if (
         len(rows)
-        and np.median(np.abs(receipt_boot_times_s - gnss_boot_time_s)) > MAX_BOOT_TIME_DIFFERENCE_S
+        and np.median(np.abs(receipt_boot_times_s - gnss_boot_clock_s)) > MAX_BOOT_TIME_DIFFERENCE_S
     ):
         # Use the receive times, because the timestamps are not boot times
-        gnss_boot_time_s = receipt_boot_times_s
-    fixes = recording.read(layout, rows, gnss_boot_time_s - delay_s)
+        gnss_boot_clock_s = receipt_boot_times_s
+    fixes = recording.read(layout, rows, gnss_boot_clock_s - delay_s)
     fixes = fixes[fixes["fix_type"] >= FIX_TYPE_3D]
     if len(fixes) < MIN_TRACK_SAMPLES:
         return unavailable_source(
@@ -242,7 +242,7 @@ def read_truth(recording: Recording, positions: tuple[PositionTrack, ...]) -> Tr
         if not samples[Columns.VELOCITY].to_numpy().any():
             # If all velocities are zero, they were not sent
             samples[Columns.VELOCITY] = np.nan
-        recording.record_stream("truth", layout.topic, clock=RECEIPT_CLOCK_TEXT)
+        recording.record_data_source("truth", layout.topic, clock=RECEIPT_CLOCK_TEXT)
         origin = find_local_origin(recording) if positions and positions[0].origin.is_gnss else None
         state = project_to_ned(samples, origin).join(samples[Columns.VELOCITY])
         return Truth(layout.topic, state[Columns.STATE], read_attitude(samples))
@@ -250,7 +250,7 @@ def read_truth(recording: Recording, positions: tuple[PositionTrack, ...]) -> Tr
     # List the messages of this track as the source of ground truth, for px4fuse info
     for track in positions:
         if mocap_truth and track.name == mocap_truth.name:
-            recording.record_stream("truth", *track.topics, clock=track.clock)
+            recording.record_data_source("truth", *track.topics, clock=track.clock)
     return mocap_truth or Unavailable(
         "ground truth",
         "the recording has neither simulation ground truth nor motion capture",

@@ -30,7 +30,7 @@ from .mavlink_frames import (
 from .mavlink_messages import (
     BOOT_CLOCK_MESSAGES,
     CONVERSION_BY_MAV_FRAME,
-    REMEDIES,
+    MISSING_DATA_REMEDIES,
 )
 from .ulog_topics import find_longest_increasing_subsequence
 
@@ -170,12 +170,12 @@ class Recording:
     # Number of samples with an invalid timestamp, by message
     dropped_count_by_message: dict[str, int] = field(default_factory=dict)
     # Messages and clock of each kind of data, such as "imu"
-    data_source_by_kind: dict[str, DataSource] = field(default_factory=dict)
+    data_source_by_data_kind: dict[str, DataSource] = field(default_factory=dict)
 
     @property
     def remedies(self) -> Mapping[str, str]:
         """Advice to the user for each kind of missing data."""
-        return REMEDIES["ArduPilot" if self.autopilot == "ArduPilot" else "PX4"]
+        return MISSING_DATA_REMEDIES["ArduPilot" if self.autopilot == "ArduPilot" else "PX4"]
 
     def rows_of_all_senders(self, message: str) -> IntArray:
         """Return the indices of the MAVLink frames that contain a message, from all senders."""
@@ -282,12 +282,14 @@ class Recording:
         is_usable = (timestamp_s > 0.0) & (is_unix_time == is_origin_unix_time)
         return np.where(is_usable, timestamp_s, self.compute_receipt_boot_times_s(rows))
 
-    def record_stream(self, data_kind: str, *messages: str, clock: str = BOOT_CLOCK_TEXT) -> None:
+    def record_data_source(
+        self, data_kind: str, *messages: str, clock: str = BOOT_CLOCK_TEXT
+    ) -> None:
         """Store the origin of a kind of data, such as "imu", for the report.
 
         The origin is the names of the MAVLink messages, and the clock of their timestamps.
         """
-        self.data_source_by_kind[data_kind] = DataSource(messages, clock, self.frames.name)
+        self.data_source_by_data_kind[data_kind] = DataSource(messages, clock, self.frames.name)
 
 
 def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
@@ -421,8 +423,8 @@ def _find_restarts(boot_times_s: Array) -> IntArray:
     rows = np.flatnonzero(np.diff(boot_times_s) < -MIN_BACKWARD_STEP_AT_RESTART_S) + 1
     earlier_rows = np.maximum(rows - 1 - RESTART_CHECK_MESSAGE_COUNT, 0)
     later_rows = np.minimum(rows + RESTART_CHECK_MESSAGE_COUNT, len(boot_times_s) - 1)
-    times_before_s = np.minimum(boot_times_s[earlier_rows], boot_times_s[rows - 1])
-    is_restart = boot_times_s[later_rows] < times_before_s - MIN_BACKWARD_STEP_AT_RESTART_S
+    times_before_step_s = np.minimum(boot_times_s[earlier_rows], boot_times_s[rows - 1])
+    is_restart = boot_times_s[later_rows] < times_before_step_s - MIN_BACKWARD_STEP_AT_RESTART_S
     return rows[is_restart]
 
 

@@ -49,7 +49,7 @@ MAX_BOOT_TIME_DIFFERENCE_S = 10.0
 MIN_CLOCK_DIFFERENCE_REDUCTION_BY_TIMESYNC_S = 0.1
 MIN_TIMESYNC_REPLIES = 3
 # Maximum interval (s) between positions; a longer interval is a gap
-MAX_REGULAR_SAMPLE_INTERVAL_S = 1.0
+MIN_SAMPLE_GAP_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -314,7 +314,7 @@ def _describe_stopped_clock(
     # Jitter of the receive time, if the sender sends at regular intervals: an interval is the
     # difference of two receive times, so its standard deviation is √2 times the jitter
     intervals_s = np.diff(receive_times_s)
-    intervals_s = intervals_s[intervals_s < MAX_REGULAR_SAMPLE_INTERVAL_S]
+    intervals_s = intervals_s[intervals_s < MIN_SAMPLE_GAP_S]
     jitter_s = float(np.std(intervals_s) / np.sqrt(2.0)) if len(intervals_s) else 0.0
     return SenderClockConversion(
         None,

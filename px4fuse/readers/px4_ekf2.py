@@ -106,7 +106,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
             "vehicle_local_position has no finite sample",
             "Start the recording after EKF2 has started.",
         )
-    topics.record_stream("ekf2_state", LOCAL_POSITION_LAYOUT.topic)
+    topics.record_data_source("ekf2_state", LOCAL_POSITION_LAYOUT.topic)
     aid_enabled_flags = read_enabled_aids(topics)
     fusion_flags = _read_fusion_flags(topics, aid_enabled_flags)
     vision_gate = fill_parameters_with_defaults(parameters)[EV_POS.gate]
@@ -114,7 +114,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     notes: tuple[str, ...] = ()
     innovations, innovation_topics = collect_innovations_by_axis(aids, fusion_flags, vision_gate)
     if innovation_topics:
-        topics.record_stream("ekf2_innovations", *innovation_topics)
+        topics.record_data_source("ekf2_innovations", *innovation_topics)
         topic = innovation_topics[0]
         if not any("timestamp_sample" in table for table in topics.tables_of(topic)):
             notes = (
@@ -160,7 +160,7 @@ def _select_variance(topics: Topics, horizon_state: TableOrUnavailable) -> Table
     variance = variance[(variance > 0.0).all(axis=1)]
     if variance.empty:
         return VARIANCES_NOT_LOGGED
-    topics.record_stream("ekf2_variance", _find_state_vector(topics)[0])
+    topics.record_data_source("ekf2_variance", _find_state_vector(topics)[0])
     return variance
 
 
@@ -285,11 +285,15 @@ def compute_samples_per_step(
     if not smaller_count or not is_ambiguous or not len(samples_between_ends):
         return larger_count
     # Not all predictions are logged, so multiples of the count agree too
-    fits_larger_count, fits_smaller_count = (
+    is_larger_count_possible, is_smaller_count_possible = (
         np.mean(samples_between_ends % count == 0.0) > 0.9
         for count in (larger_count, smaller_count)
     )
-    return smaller_count if fits_smaller_count and not fits_larger_count else larger_count
+    return (
+        smaller_count
+        if is_smaller_count_possible and not is_larger_count_possible
+        else larger_count
+    )
 
 
 def _read_accelerometer_bias(
@@ -335,7 +339,7 @@ def _read_fusion_flags(topics: Topics, enabled_aids: StepFunctions) -> TableOrUn
             DEFAULT_PROFILE_REMEDY,
         )
     topic = STATUS_FLAGS_TOPIC if topics.instances(STATUS_FLAGS_TOPIC) else STATUS_TOPIC
-    topics.record_stream("ekf2_fusing", topic)
+    topics.record_data_source("ekf2_fusing", topic)
     return flags
 
 
@@ -450,8 +454,8 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     sample_count = np.rint(steps_s / interval_s)
     previous_output_weight = (1.0 - FLOW_FILTER_NEW_SAMPLE_WEIGHT) ** sample_count
     filtered_velocity = flow_velocity[["forward_m_s", "right_m_s"]]
-    previous_part = filtered_velocity.shift().mul(previous_output_weight, axis=0)
-    flow = (filtered_velocity - previous_part).div(1.0 - previous_output_weight, axis=0)
+    previous_output_term = filtered_velocity.shift().mul(previous_output_weight, axis=0)
+    flow = (filtered_velocity - previous_output_term).div(1.0 - previous_output_weight, axis=0)
     # 2. Noise variance: it is logged in (rad/s)². The range to the ground, velocity ÷ flow rate of
     # the newest sample, converts it to (m/s)²
     newest_velocity = flow_velocity[["newest_forward_m_s", "newest_right_m_s"]]

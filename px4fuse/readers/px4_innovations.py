@@ -33,7 +33,7 @@ MAX_TIME_FROM_INNOVATION_TO_VARIANCE_S = 0.6
 # Column and PX4 field for the time of the last fusion
 LAST_FUSION_FIELD = {"last_fused_us": "time_last_fuse"}
 # Optional fields of the topics estimator_aid_src_*, by aiding source and column
-OPTIONAL_FIELDS = {
+OPTIONAL_AID_FIELDS = {
     "baro_hgt": {"observation_down": "observation", "filtered_down": "innovation_filtered"},
     "ev_pos": LAST_FUSION_FIELD,
     "gnss_pos": LAST_FUSION_FIELD,
@@ -275,7 +275,7 @@ def _read_aid_topic(
     for name, field in field_by_quantity.items():
         columns |= _assign_fields_by_axis(name, aid, field + "[]" * (len(aid.axes) > 1))
     layout = MessageLayout(
-        f"estimator_aid_src_{aid.name}", columns, OPTIONAL_FIELDS.get(aid.name, {})
+        f"estimator_aid_src_{aid.name}", columns, OPTIONAL_AID_FIELDS.get(aid.name, {})
     )
     if topics.find_layout(layout) is None:  # return early: reading an empty table takes time
         return None

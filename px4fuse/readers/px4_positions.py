@@ -64,7 +64,7 @@ NO_FIX_ACTION = "Give the antenna a free view of the sky and wait for a fix."
 # Maximum delay (µs) from timestamp to publication, if the timestamp is the arrival time
 MAX_ARRIVAL_TO_PUBLICATION_DELAY_US = 100
 # A log has no measurement times if at least this fraction of the timestamps are arrival times
-MIN_ARRIVAL_TIME_FRACTION = 0.9
+MIN_ARRIVAL_TIMESTAMP_FRACTION = 0.9
 # Maximum time (s) between a height and the horizontal position with which it is combined: an error
 # of 2.5 cm at 0.5 m/s
 MAX_TIME_FROM_POSITION_TO_HEIGHT_S = 0.05
@@ -92,7 +92,7 @@ def read_positions(topics: Topics, ekf2: Ekf2 | Unavailable) -> TracksAndMissing
     fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else ekf2
     # If EKF2 fused the yaw of the source, the source is odometry
     is_odometry = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags["yaw"] > 0).any())
-    return split_tracks(
+    return separate_unavailable_tracks(
         [
             *(_read_logged_track(topics, name) for name in SOURCE_TRACK_NAMES),
             _read_fused_observation(topics, is_odometry),
@@ -102,7 +102,9 @@ def read_positions(topics: Topics, ekf2: Ekf2 | Unavailable) -> TracksAndMissing
     )
 
 
-def split_tracks(tracks: list[PositionTrack | Unavailable]) -> TracksAndMissingSources:
+def separate_unavailable_tracks(
+    tracks: list[PositionTrack | Unavailable],
+) -> TracksAndMissingSources:
     """Separate available positions, best source first, from missing position sources."""
     available_tracks = sorted(
         (track for track in tracks if isinstance(track, PositionTrack)),
@@ -219,7 +221,10 @@ def _describe_unusual_clock(topics: Topics, topic: str) -> ClockConversion | Non
     published_us = table["timestamp"].astype(np.int64)
     sample_timestamps_us = table["timestamp_sample"].astype(np.int64)
     age_us = published_us - sample_timestamps_us
-    if np.mean(np.abs(age_us) <= MAX_ARRIVAL_TO_PUBLICATION_DELAY_US) >= MIN_ARRIVAL_TIME_FRACTION:
+    if (
+        np.mean(np.abs(age_us) <= MAX_ARRIVAL_TO_PUBLICATION_DELAY_US)
+        >= MIN_ARRIVAL_TIMESTAMP_FRACTION
+    ):
         clock_name = SENDER_CLOCK
         note = "PX4 replaced timestamps by arrival times, because the clocks were not synchronised"
     elif abs(np.median(age_us)) > MAX_PUBLICATION_LAG_S * 1e6:
@@ -467,8 +472,8 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     # 1. Times of measurement
     parameters = topics.ekf2_parameters
     age_s = fixes["published_s"] - fixes.index
-    has_measurement_times = age_s.max() > MAX_ARRIVAL_TO_PUBLICATION_DELAY_US * 1e-6
-    if GNSS_MODE_PARAMETER in parameters and has_measurement_times:
+    has_logged_measurement_times = age_s.max() > MAX_ARRIVAL_TO_PUBLICATION_DELAY_US * 1e-6
+    if GNSS_MODE_PARAMETER in parameters and has_logged_measurement_times:
         delay_s = 0.0
         clock = "autopilot boot clock: measurement times from the GNSS driver"
     else:
@@ -557,23 +562,25 @@ def read_truth(
     local_layout = TOPIC_LAYOUTS["vehicle_local_position_groundtruth"]
     global_layout = TOPIC_LAYOUTS["vehicle_global_position_groundtruth"]
     logged_local_samples = topics.read(local_layout)
-    local_samples = select_valid_rows(logged_local_samples, logged_local_samples.columns.tolist())
+    local_truth_samples = select_valid_rows(
+        logged_local_samples, logged_local_samples.columns.tolist()
+    )
     global_positions = select_valid_rows(topics.read(global_layout), Columns.GEODETIC[:2])
     if len(global_positions):
         projected_positions = project_to_ned(global_positions, _find_local_origin(topics))
-        if local_samples.empty:
+        if local_truth_samples.empty:
             velocity = global_positions.reindex(columns=Columns.VELOCITY)
             return Truth(global_layout.topic, projected_positions.join(velocity), attitude)
         if has_fused_aid(ekf2):
-            local_samples = local_samples.copy()
+            local_truth_samples = local_truth_samples.copy()
             # The frames differ by a constant on each axis; NaN if the topics have no common times
             for column in Columns.POSITION:
                 shift_m = projected_positions[column] - interpolate_inside_time_span(
-                    projected_positions.index, local_samples[column]
+                    projected_positions.index, local_truth_samples[column]
                 )
-                local_samples[column] += np.nan_to_num(shift_m.median())
-    if len(local_samples):
-        return Truth(local_layout.topic, local_samples, attitude)
+                local_truth_samples[column] += np.nan_to_num(shift_m.median())
+    if len(local_truth_samples):
+        return Truth(local_layout.topic, local_truth_samples, attitude)
     if mocap_truth := find_motion_capture_truth(positions):
         return mocap_truth
     reason = "the log has neither simulation ground truth nor motion capture"

@@ -69,11 +69,11 @@ def read_ulog(name: str, content: bytes) -> Flight:
     positions, unavailable_positions = read_positions(topics, ekf2)
     truth = read_truth(topics, positions, ekf2)
     if isinstance(truth, Truth):
-        topics.record_stream("truth", truth.name)
+        topics.record_data_source("truth", truth.name)
     airborne_spans_s = _read_airborne_spans(topics)
     altitude_m = topics.read(TOPIC_LAYOUTS["vehicle_air_data"])["altitude_m"]
     barometer_delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
-    is_in_flight = common.ends_in_flight(airborne_spans_s, topics.log.duration_s)
+    ends_in_flight = common.ends_in_flight(airborne_spans_s, topics.log.duration_s)
     dropped_counts = dict(sorted(topics.dropped.items()))
     # Flags of the failure detector for roll and pitch
     has_excessive_tilt = topics.read(TOPIC_LAYOUTS["failure_detector_status"]).any(axis=1)
@@ -83,8 +83,8 @@ def read_ulog(name: str, content: bytes) -> Flight:
             notes=(*topics.log.notes, *describe_dropped_samples(dropped_counts)),
             dropped=dropped_counts,
             start_unix_s=_estimate_start_unix_s(topics),
-            damage=_describe_damage(topics, imu, is_in_flight),
-            ends_in_flight=is_in_flight,
+            damage=_describe_damage(topics, imu, ends_in_flight),
+            ends_in_flight=ends_in_flight,
         ),
         imu=imu,
         attitude=attitude,
@@ -95,7 +95,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
         excessive_tilt_spans_s=common.find_spans(has_excessive_tilt, topics.log.duration_s),
         barometer=barometer(altitude_m, barometer_delay_s),
         missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *unavailable_positions),
-        streams=topics.data_source_by_kind,
+        streams=topics.data_source_by_data_kind,
         unused=tuple(
             UnusedData(name, len(table["timestamp"]), reason)
             for name, reason in UNUSED_TOPICS.items()
@@ -105,12 +105,12 @@ def read_ulog(name: str, content: bytes) -> Flight:
 
 
 def _describe_damage(
-    topics: Topics, imu: TableOrUnavailable, is_in_flight: bool
+    topics: Topics, imu: TableOrUnavailable, ends_in_flight: bool
 ) -> tuple[str, ...]:
     duration_s = topics.log.duration_s
     damage_sentences = []
     if topics.is_truncated:
-        damage_sentences.append(common.format_truncation("message", duration_s, is_in_flight))
+        damage_sentences.append(common.format_truncation("message", duration_s, ends_in_flight))
     if topics.is_damaged:
         missing_imu_duration_s = duration_s
         if not isinstance(imu, Unavailable):
@@ -133,15 +133,17 @@ def _estimate_start_unix_s(topics: Topics) -> float | None:
 
 
 def _require_samples(
-    topics: Topics, samples: pd.DataFrame, name: str, layout: common.MessageLayout, remedy: str
+    topics: Topics, samples: pd.DataFrame, data_kind: str, layout: common.MessageLayout, remedy: str
 ) -> TableOrUnavailable:
     """Return the samples of a topic, or the reason if there are fewer than two."""
     topic = layout.topic
     if topics.find_layout(layout) is None:
-        return Unavailable(name, f"{topic} is not logged", DEFAULT_PROFILE_REMEDY)
+        return Unavailable(data_kind, f"{topic} is not logged", DEFAULT_PROFILE_REMEDY)
     if len(samples) < 2:
-        return Unavailable(name, f"{topic} contains only {len(samples)} usable samples", remedy)
-    topics.record_stream(name.lower(), topic)
+        return Unavailable(
+            data_kind, f"{topic} contains only {len(samples)} usable samples", remedy
+        )
+    topics.record_data_source(data_kind.lower(), topic)
     return samples
 
 
@@ -156,11 +158,11 @@ def _read_imu(topics: Topics) -> pd.DataFrame:
         is_valid &= np.abs(columns[name]) < common.MAX_IMU_READING
     rows = np.flatnonzero(is_valid)
     # Boot times, because find_longest_increasing_subsequence needs positive times
-    boot_time_us = np.rint(
+    boot_clock_us = np.rint(
         imu.index.to_numpy()[rows] * 1e6 + offset_us[rows] + topics.time_origin_us
     )
-    kept_rows = find_longest_increasing_subsequence(boot_time_us.astype(np.int64))
-    time_s = (boot_time_us[kept_rows] - topics.time_origin_us) * 1e-6
+    kept_rows = find_longest_increasing_subsequence(boot_clock_us.astype(np.int64))
+    time_s = (boot_clock_us[kept_rows] - topics.time_origin_us) * 1e-6
     rows = rows[kept_rows]
     samples = np.empty((len(columns), len(rows)), np.float32)  # as in the log, to save memory
     for row, values in zip(samples, columns.values(), strict=True):
@@ -176,5 +178,5 @@ def _read_airborne_spans(topics: Topics) -> Spans | Unavailable:
             "vehicle_land_detected is not logged or not usable",
             f"{DEFAULT_PROFILE_REMEDY} Or give the start and end of the flight (--start, --end).",
         )
-    topics.record_stream("airborne", "vehicle_land_detected")
+    topics.record_data_source("airborne", "vehicle_land_detected")
     return common.find_spans(land_detected["landed"] == 0.0, topics.log.duration_s)

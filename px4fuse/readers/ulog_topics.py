@@ -47,11 +47,11 @@ _MICROSECOND_S = 1e-6
 # Maximum delay (s) from measurement to publication; otherwise, timestamp_sample is not boot time
 MAX_PUBLICATION_LAG_S = 10.0
 # Maximum time (s) of a valid sample before or after the IMU data
-MAX_TIME_OUTSIDE_IMU_DATA_S = 2.0
+MAX_SAMPLE_TIME_OUTSIDE_IMU_S = 2.0
 # ULog info message with a note for the users of the log
-NOTE_KEY = "px4fuse_note"
+ULOG_NOTE_KEY = "px4fuse_note"
 # ULog info message that marks a student assignment
-ASSIGNMENT_FLAG_KEY = "px4fuse_assessed"
+ULOG_ASSIGNMENT_KEY = "px4fuse_assessed"
 # True for commands of instructors, which show the diagnosis of an assignment
 shows_diagnosis_of_assignments = ContextVar("shows_diagnosis_of_assignments", default=False)
 # Maximum interval (s) between valid IMU timestamps
@@ -71,7 +71,7 @@ TopicTables = dict[tuple[str, int], TopicArrays]
 # Time (s) and number of each new primary EKF2 instance
 InstanceSwitches = tuple[tuple[float, int], ...]
 # Value for logs without a change of the primary instance: EKF2 instance 0 is always primary
-NO_INSTANCE_SWITCHES: InstanceSwitches = ((-np.inf, 0),)
+NO_EKF2_INSTANCE_SWITCHES: InstanceSwitches = ((-np.inf, 0),)
 
 
 class _ULogContent(io.BytesIO):
@@ -219,7 +219,7 @@ class Topics:
     # Changes of EKF2 parameters after take-off
     parameter_changes: tuple[ParameterChange, ...]
     # Topics and clock of each kind of data, such as "imu"
-    data_source_by_kind: dict[str, DataSource] = field(default_factory=dict)
+    data_source_by_data_kind: dict[str, DataSource] = field(default_factory=dict)
     # Number of samples with an invalid timestamp, by topic
     dropped: dict[str, int] = field(default_factory=dict)
 
@@ -243,7 +243,7 @@ class Topics:
         instances = instances[instances < 255]  # 255 means that no instance is selected yet
         changes = instances[instances.ne(instances.shift())].astype(int)
         if changes.empty:
-            return NO_INSTANCE_SWITCHES
+            return NO_EKF2_INSTANCE_SWITCHES
         # The first instance counts as primary from the beginning of the log
         switch_times_s = [-np.inf, *changes.index[1:]]
         return tuple(zip(switch_times_s, changes.tolist(), strict=True))
@@ -290,8 +290,8 @@ class Topics:
         samples = pd.DataFrame(values.T, index, list(fields), copy=False)
         if layout.is_step_function:
             return samples
-        end_s = self.log.duration_s + MAX_TIME_OUTSIDE_IMU_DATA_S
-        return rows_between(samples, -MAX_TIME_OUTSIDE_IMU_DATA_S, end_s)
+        end_s = self.log.duration_s + MAX_SAMPLE_TIME_OUTSIDE_IMU_S
+        return rows_between(samples, -MAX_SAMPLE_TIME_OUTSIDE_IMU_S, end_s)
 
     def read(self, *layouts: MessageLayout) -> pd.DataFrame:
         """Read a topic with the first of several definitions whose required fields are logged.
@@ -312,7 +312,7 @@ class Topics:
         """
         if self.find_layout(layout) is None:
             return _empty_frame(layout)
-        if self.primary_instances == NO_INSTANCE_SWITCHES:
+        if self.primary_instances == NO_EKF2_INSTANCE_SWITCHES:
             return select_rows(self.read_instance(layout))
         primary_instance_number = pd.Series(dict(self.primary_instances), dtype=np.float64)
         instance_tables: list[pd.DataFrame] = []
@@ -323,7 +323,7 @@ class Topics:
         joined_tables = pd.concat(instance_tables).sort_index()
         return joined_tables[~joined_tables.index.duplicated()]
 
-    def record_stream(self, data_kind: str, *topics: str) -> None:
+    def record_data_source(self, data_kind: str, *topics: str) -> None:
         """Store the origin of a kind of data, such as "imu", for the report.
 
         The origin is the names of the topics, and the clock of their timestamps.
@@ -335,7 +335,7 @@ class Topics:
         )
         timestamp_kind = "measurement" if has_measurement_time else "publication"
         clock = f"autopilot boot clock ({timestamp_kind} time)"
-        self.data_source_by_kind[data_kind] = DataSource(topics, clock, self.log.name)
+        self.data_source_by_data_kind[data_kind] = DataSource(topics, clock, self.log.name)
 
 
 def _empty_frame(layout: MessageLayout) -> pd.DataFrame:
@@ -430,8 +430,8 @@ def read_topics(name: str, content: bytes) -> Topics:
     if not tables:
         names = join_first_names(sorted({topic for topic, _ in known_or_all_topic_tables}), 5)
         notes.append(f"the log contains only topics that px4fuse does not use ({names})")
-    if NOTE_KEY in info:
-        notes.append(_read_printable_text(info, NOTE_KEY, ""))
+    if ULOG_NOTE_KEY in info:
+        notes.append(_read_printable_text(info, ULOG_NOTE_KEY, ""))
     time_origin_us, data_end_us = _find_data_span_us(known_or_all_topic_tables, name)
     logged_values, parameter_changes = _read_parameters(ulog, tables, time_origin_us)
     parameter_values, invalid_parameter_notes = replace_invalid_parameters(logged_values)
@@ -468,7 +468,7 @@ def read_topics(name: str, content: bytes) -> Topics:
         autopilot=_read_printable_text(info, "sys_name", "PX4"),
         vehicle=_read_printable_text(info, "sys_uuid", ""),
         is_assessed=True
-        if ASSIGNMENT_FLAG_KEY in info and not shows_diagnosis_of_assignments.get()
+        if ULOG_ASSIGNMENT_KEY in info and not shows_diagnosis_of_assignments.get()
         else UNSET,
     )
     return Topics(

@@ -390,11 +390,11 @@ def _format_verdict_lines(card: DiagnosisCard) -> Iterator[Paragraph]:
     heading = f"Consistency{direction_text}: RMS of error ÷ reported σ (expected 1)"
     yield Paragraph(heading, "", "  ")
     legend = f"  ░ consistent ({format_consistent_ratios()})"
-    left_end, right_end = "← reported σ too large", "too small →"
+    left_label, right_label = "← reported σ too large", "too small →"
     # the plot has 8 more characters than its axis: the labels of the ends
-    right_end_width = SIGMA_RATIO_AXIS_WIDTH + 8 - len(left_end)
+    right_label_width = SIGMA_RATIO_AXIS_WIDTH + 8 - len(left_label)
     yield Paragraph(
-        f"{'':{SIGMA_RATIO_AXIS_INDENT}}", plot=f"{left_end}{right_end:>{right_end_width}}"
+        f"{'':{SIGMA_RATIO_AXIS_INDENT}}", plot=f"{left_label}{right_label:>{right_label_width}}"
     )
     yield Paragraph(f"{legend:{SIGMA_RATIO_AXIS_INDENT}}", plot=_format_tick_labels())
     if any(verdict.is_explained for verdict in card.verdicts):

@@ -74,7 +74,7 @@ AIDS_TERMS_NOTE = (
 )
 ALL_FINDINGS_TITLE = "All findings"
 # Heights (points) of the map and of each plot: beside the map, and below a map of full page width
-HEIGHTS_IN_COLUMNS, HEIGHTS_AT_FULL_WIDTH = (190.0, 50.0), (84.0, 64.0)
+FIGURE_HEIGHTS_IN_COLUMNS, FIGURE_HEIGHTS_AT_FULL_WIDTH = (190.0, 50.0), (84.0, 64.0)
 # Tracks with a larger ratio of length to width have a map of full page width
 MIN_LENGTH_TO_WIDTH_RATIO_OF_WIDE_MAP = 2.2
 MAX_DRAWN_SIGMAS = 4.0  # larger innovations ÷ √S are triangles at the edge
@@ -117,7 +117,7 @@ def add_card(page: Page, card: DiagnosisCard) -> None:
 
 def _make_verdict_row(verdict: Verdict) -> dict[str, Any]:
     word = f"{verdict.word}, explained" if verdict.is_explained else verdict.word
-    return _make_ratio_row(
+    return _make_sigma_ratio_row(
         verdict.ratio,
         verdict.against,
         verdict.interval,
@@ -131,7 +131,7 @@ def _make_verdict_row(verdict: Verdict) -> dict[str, Any]:
 
 
 def _make_aid_row(aid: AidConsistency) -> dict[str, Any]:
-    return _make_ratio_row(
+    return _make_sigma_ratio_row(
         aid.ratio,
         filter="ekf2",
         label="",
@@ -142,17 +142,17 @@ def _make_aid_row(aid: AidConsistency) -> dict[str, Any]:
     )
 
 
-def _make_ratio_row(
-    ratio: float | None,
+def _make_sigma_ratio_row(
+    sigma_ratio: float | None,
     reference_of_actual_error: Reference = "source",
     interval: tuple[float, float] | None = None,
     **fields: str | bool,
 ) -> dict[str, Any]:
-    if ratio is None:
+    if sigma_ratio is None:
         return {"ratio": "", **fields}
     return {
-        "ratio": format_ratio(ratio),
-        **locate_sigma_ratio(ratio, reference_of_actual_error, interval),
+        "ratio": format_ratio(sigma_ratio),
+        **locate_sigma_ratio(sigma_ratio, reference_of_actual_error, interval),
         **fields,
     }
 
@@ -177,7 +177,7 @@ def write_panels(page: Page, analysis: Analysis, card: DiagnosisCard) -> None:
     length_m, width_m = np.ptp(tracks["positions"], axis=1)
     is_wide = length_m > MIN_LENGTH_TO_WIDTH_RATIO_OF_WIDE_MAP * width_m
     left, right = (section, section) if is_wide else make_columns()
-    map_height, plot_height = HEIGHTS_AT_FULL_WIDTH if is_wide else HEIGHTS_IN_COLUMNS
+    map_height, plot_height = FIGURE_HEIGHTS_AT_FULL_WIDTH if is_wide else FIGURE_HEIGHTS_IN_COLUMNS
     _draw_map(left, analysis, tracks, axis_names, map_height)
     _draw_error_plots(right, analysis, card, plot_height)
     _draw_innovations(right, analysis, plot_height)

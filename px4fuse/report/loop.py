@@ -252,13 +252,15 @@ def make_pose_graph_page(graph: Graph) -> Page:
     elif not gates:
         page.write_labelled_text("Gate", "the graph has no loop closures to test")
     else:
-        gate_texts = [
+        rejected_closure_texts = [
             f"{gate.first} – {gate.second}: d² {gate.d2:.1f}, p {gate.p:.2g}"
             for gate in gates
             if not gate.accepted
         ]
-        count_text = f"{len(gate_texts)} of {len(gates)} loop closures rejected"
-        rejected_closure_lines = join_first_names(gate_texts, MAX_LISTED_CLOSURES, "\n").split("\n")
+        count_text = f"{len(rejected_closure_texts)} of {len(gates)} loop closures rejected"
+        rejected_closure_lines = join_first_names(
+            rejected_closure_texts, MAX_LISTED_CLOSURES, "\n"
+        ).split("\n")
         page.write_labelled_text("Gate", count_text, *rejected_closure_lines)
         if len(gates) > MAX_GNC_CLOSURES and len(graph.solutions) == 1:
             page.write_labelled_text(

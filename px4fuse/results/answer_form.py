@@ -467,8 +467,8 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
     for mistake in answers.mistakes:
         fault_kind = FAULT_KINDS.get(mistake.kind)
         size_units = fault_kind.units if fault_kind else ()
-        value_units = UNITS_BY_CORRECTION.get(mistake.parameter, ())
-        value_text = _format_number_with_unit(mistake.value, mistake.value_unit, value_units)
+        correction_units = UNITS_BY_CORRECTION.get(mistake.parameter, ())
+        value_text = _format_number_with_unit(mistake.value, mistake.value_unit, correction_units)
         times = (("from", mistake.from_s), ("until", mistake.until_s))
         time_texts = [f"{word} {time_s:g} s" for word, time_s in times if time_s is not None]
         details = (

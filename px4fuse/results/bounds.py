@@ -113,14 +113,14 @@ def _drop_invalid_values(
                 text_fields = {"what": path, "reason": error.reason, "remedy": CHECK_LOG_REMEDY}
                 # keep fields that the Unavailable object also has, for example the errors of a
                 # filter against ground truth if its NIS is not valid
-                other_fields = {
+                kept_fields = {
                     field.name: _drop_invalid_values(
                         getattr(value, field.name), field.type, path, errors
                     )
                     for field in fields(unavailable_type)
                     if field.name not in text_fields and hasattr(value, field.name)
                 }
-                return unavailable_type(**text_fields, **other_fields)
+                return unavailable_type(**text_fields, **kept_fields)
         # otherwise, the caller removes the value
         raise
     return value

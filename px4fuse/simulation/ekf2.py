@@ -85,7 +85,7 @@ LOG_PROFILE_WITHOUT_VISION = 1
 # Length (µs) of EKF2's prediction step: parameter EKF2_PREDICT_US
 PREDICTION_STEP_US = 10_000
 # Initial σ (gauss) of earth field and magnetometer bias, on each axis
-MAGNETIC_FIELD_SIGMA_GAUSS = 0.03
+INITIAL_FIELD_SIGMA_GAUSS = 0.03
 # Time (s) without fusion after which EKF2 holds the position: EKF2_NOAID_TOUT
 # (fake_pos_control.cpp)
 NO_AID_TIMEOUT_S = 5.0
@@ -180,7 +180,7 @@ def simulate_ekf2(
                 ),
                 # EKF2 initialises earth field and magnetometer bias on the ground
                 np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)]),
-                np.full(6, MAGNETIC_FIELD_SIGMA_GAUSS**2),
+                np.full(6, INITIAL_FIELD_SIGMA_GAUSS**2),
             )
     # 2. Rules for the fusion of the positions, and the fusion horizon
     settings = fill_parameters_with_defaults(logged_values, *_select_fused_aids(scenario))

@@ -209,7 +209,7 @@ def _make_position_aid_topics(
     # measured minus estimated position. The states are the velocity (3 columns), then the position
     estimated_m = ekf2_output.states_at_fusion_horizon[logged_steps, 3:5]
     # row 0 of the variances is before the first event, so the row after event i is i + 1
-    estimate_variance = model_run.variance[logged_indices + 1, 0, HORIZONTAL_POSITION]
+    state_variance = model_run.variance[logged_indices + 1, 0, HORIZONTAL_POSITION]
     position_noise_variance = noise_variance[:, HORIZONTAL_POSITION_COLUMNS]
     position_innovation = innovation[:, HORIZONTAL_POSITION_COLUMNS]
     is_untested = np.isnan(position_innovation[:, :1])
@@ -231,7 +231,7 @@ def _make_position_aid_topics(
         np.where(is_untested, measured_m - estimated_m, position_innovation),
         np.where(
             is_untested,
-            estimate_variance + position_noise_variance,
+            state_variance + position_noise_variance,
             innovation_variance[:, HORIZONTAL_POSITION_COLUMNS],
         ).astype(float),
         position_noise_variance,

@@ -13,7 +13,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import GNSS_POS
 from px4fuse.flight.model import Flight
 from px4fuse.readers.ulog import read_ulog
-from px4fuse.readers.ulog_topics import ASSIGNMENT_FLAG_KEY, NOTE_KEY
+from px4fuse.readers.ulog_topics import ULOG_ASSIGNMENT_KEY, ULOG_NOTE_KEY
 
 from . import ekf2, sensors
 from .faults import FAULT_TYPES, FaultSizes, format_fault, injected_fault_names
@@ -124,9 +124,9 @@ def to_ulog(simulation: Simulation, *, is_assessed: bool = False) -> bytes:
         "ver_sw_release": PX4_RELEASE,
     }
     if simulation.scenario.ekf2:
-        info[NOTE_KEY] = SIMULATED_EKF2_NOTE
+        info[ULOG_NOTE_KEY] = SIMULATED_EKF2_NOTE
     if is_assessed:
-        info[ASSIGNMENT_FLAG_KEY] = 1
+        info[ULOG_ASSIGNMENT_KEY] = 1
     return encode_ulog(simulation.topics, simulation.parameters, info, sensors.FIRST_TIMESTAMP_US)
 
 

@@ -139,7 +139,7 @@ class Motion:
         )
         yaw_rad, yaw_rate_rad_s = _differentiate(self.yaw, time_s, (0, 1))
         # factor on the deviation from the path: 1 in the air and 0 on the ground
-        path_deviation_factor = _sum_ramps(
+        path_deviation_ramp = _sum_ramps(
             [
                 (self.take_off_s, PATH_DEVIATION_RAMP_DURATION_S, np.array([1.0])),
                 (
@@ -150,7 +150,7 @@ class Motion:
             ]
         )
         # derivatives of the product factor · deviation (Leibniz rule)
-        f0, f1, f2, f3 = _differentiate(path_deviation_factor, time_s, range(4))
+        f0, f1, f2, f3 = _differentiate(path_deviation_ramp, time_s, range(4))
         d0, d1, d2, d3 = self.path_deviation.compute_values(time_s, 4)
         return TrueState(
             position_m=position + f0 * d0,
@@ -195,8 +195,8 @@ def compute_attitude_and_imu(state: TrueState) -> AttitudeAndImu:
     # The thrust is along -z, so z = a/|a| with a = gravity - acceleration, and da/dt = -jerk.
     # dz/dt is da/dt / |a| without its component along z, because z keeps its length
     z = negative_thrust_acceleration_m_s2 / specific_thrust_m_s2
-    z_derivative_per_s = -state.jerk_m_s3 / specific_thrust_m_s2
-    z_derivative_per_s -= z * _dot(z, z_derivative_per_s)[:, None]
+    body_z_derivative_per_s = -state.jerk_m_s3 / specific_thrust_m_s2
+    body_z_derivative_per_s -= z * _dot(z, body_z_derivative_per_s)[:, None]
     forward_direction, right_direction = (
         np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
         for angle in (state.yaw_rad, state.yaw_rad + np.pi / 2.0)
@@ -205,7 +205,7 @@ def compute_attitude_and_imu(state: TrueState) -> AttitudeAndImu:
     # the yaw rate, so du/dt = dz/dt × forward direction + yaw rate · z × right direction
     unnormalised_y = np.cross(z, forward_direction)
     unnormalised_y_derivative_per_s = np.cross(
-        z_derivative_per_s, forward_direction
+        body_z_derivative_per_s, forward_direction
     ) + state.yaw_rate_rad_s[:, None] * np.cross(z, right_direction)
     unnormalised_y_length = np.sqrt(_dot(unnormalised_y, unnormalised_y))
     y = unnormalised_y / unnormalised_y_length[:, None]
@@ -215,8 +215,8 @@ def compute_attitude_and_imu(state: TrueState) -> AttitudeAndImu:
     # perpendicular to u
     rate_rad_s = np.stack(
         [
-            -_dot(z_derivative_per_s, y),
-            _dot(z_derivative_per_s, x),
+            -_dot(body_z_derivative_per_s, y),
+            _dot(body_z_derivative_per_s, x),
             -_dot(unnormalised_y_derivative_per_s, x) / unnormalised_y_length,
         ],
         axis=1,

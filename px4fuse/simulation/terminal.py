@@ -16,7 +16,7 @@ PATH_AND_SOURCE_BY_KIND = {
 }
 
 
-def summary(simulation: Simulation, answer: Path | None) -> Page:
+def summary(simulation: Simulation, answer_key_path: Path | None) -> Page:
     """Format the simulated flight with its injected faults."""
     scenario, page = simulation.scenario, Page()
     path, source = PATH_AND_SOURCE_BY_KIND[scenario.kind]
@@ -43,6 +43,8 @@ def summary(simulation: Simulation, answer: Path | None) -> Page:
     page.write_labelled_text(
         "EKF2", "from px4fuse's model of EKF2" if scenario.ekf2 else "not simulated (--no-ekf2)"
     )
-    if answer is not None:
-        page.write_labelled_text("Answer", f"{to_one_line(str(answer))} (not for students)")
+    if answer_key_path is not None:
+        page.write_labelled_text(
+            "Answer", f"{to_one_line(str(answer_key_path))} (not for students)"
+        )
     return page

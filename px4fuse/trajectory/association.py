@@ -23,7 +23,7 @@ AssociationMethod = Literal["interpolate", "nearest"]
 # Default maximum gap in the reference for interpolation, in median pose intervals
 MAX_GAP_IN_MEDIAN_INTERVALS = 3.0
 # A reference with a longer mean pose interval (s) is not interpolated
-MIN_SPARSE_POSE_INTERVAL_S = 2.0
+MIN_POSE_INTERVAL_LIMIT_S = 2.0
 # Lower limit (s) of the default maximum gap for interpolation
 MIN_GAP_LIMIT_S = 0.1
 # Default maximum time difference (s) of a pair of poses, as in the evo package
@@ -81,7 +81,7 @@ def associate(
     estimate_interval_s = compute_median_interval_s(estimate.time_s)
     # Default of the maximum gap, which can also change the method
     if max_gap_s is None:
-        max_interpolated_interval_s = max(MIN_SPARSE_POSE_INTERVAL_S, 2.0 * estimate_interval_s)
+        max_interpolated_interval_s = max(MIN_POSE_INTERVAL_LIMIT_S, 2.0 * estimate_interval_s)
         if method == "nearest":
             max_gap_s = MAX_PAIR_TIME_DIFFERENCE_S
         elif compute_median_interval_s(reference.time_s) > max_interpolated_interval_s:

@@ -35,7 +35,7 @@ AXES_OF_FRAME: Mapping[Frame, tuple[str, str, str]] = {
 }
 
 
-AxisComponents = Annotated[dict[str, float], Meta(min_length=3, max_length=3)]
+VectorComponents = Annotated[dict[str, float], Meta(min_length=3, max_length=3)]
 
 
 OPPOSITE_DIRECTIONS = {

@@ -88,9 +88,9 @@ Operand = float | bytes | str
 Operation = tuple[str, tuple[Operand, ...]]
 # Value in the submitted PDF, value in the redrawn PDF (generated again by px4fuse), and their key
 _ValuePair = tuple[Any, Any, str]
-# Description of a difference, and True (_STRUCTURAL) for added or missing PDF objects
+# Description of a difference, and True (_STRUCTURAL_DIFFERENCE) for added or missing PDF objects
 _PdfDifference = tuple[str, bool]
-_STRUCTURAL, _CONTENT = True, False
+_STRUCTURAL_DIFFERENCE, _CONTENT_DIFFERENCE = True, False
 
 
 def compare_pages(
@@ -155,7 +155,7 @@ class _PdfComparison:
     # fonts of the current page by name
     fonts: Mapping[str, Any] = field(default_factory=dict)
     # limited, because a malicious PDF may contain millions of values
-    value_count: int = 0
+    pdf_value_count: int = 0
 
     def find_differences(
         self, submitted_pdf: pypdf.PdfReader, redrawn_pdf: pypdf.PdfReader
@@ -181,7 +181,7 @@ class _PdfComparison:
                 yield PageDifference(0, *difference)
         # programs for PDF 1.4 ignore /XRefStm, and could display other pages
         if "/XRefStm" in submitted_pdf.trailer:
-            yield PageDifference(0, SECOND_XREF_TABLE_REASON, _STRUCTURAL)
+            yield PageDifference(0, SECOND_XREF_TABLE_REASON, _STRUCTURAL_DIFFERENCE)
 
     def _compare(self, pair: _ValuePair) -> Iterator[_PdfDifference]:
         """Yield the differences of two PDF values, including nested values."""
@@ -190,13 +190,13 @@ class _PdfComparison:
         self.pairs_to_compare = [pair]
         while self.pairs_to_compare:
             submitted_value, redrawn_value, key = self.pairs_to_compare.pop()
-            self.value_count += 1
-            if self.value_count > MAX_PDF_VALUES:
+            self.pdf_value_count += 1
+            if self.pdf_value_count > MAX_PDF_VALUES:
                 raise LimitReachedError(f"the PDF contains more than {MAX_PDF_VALUES} values")
             if isinstance(submitted_value, IndirectObject):
                 if submitted_value.generation:
                     # programs that ignore generation numbers would display another object
-                    yield f"another program changed the PDF entry {key}", _STRUCTURAL
+                    yield f"another program changed the PDF entry {key}", _STRUCTURAL_DIFFERENCE
                 if isinstance(redrawn_value, IndirectObject):
                     # objects may refer to each other in a cycle, so each pair is compared once
                     object_ids = (
@@ -210,7 +210,7 @@ class _PdfComparison:
             submitted_value = resolve_reference(submitted_value)
             redrawn_value = resolve_reference(redrawn_value)
             if _pdf_type_of(submitted_value) is not _pdf_type_of(redrawn_value):
-                yield f"the PDF entry {key} has a wrong type", _STRUCTURAL
+                yield f"the PDF entry {key} has a wrong type", _STRUCTURAL_DIFFERENCE
             elif isinstance(redrawn_value, DictionaryObject):
                 yield from self._compare_dictionaries(submitted_value, redrawn_value, key)
             elif isinstance(redrawn_value, ArrayObject):
@@ -218,7 +218,7 @@ class _PdfComparison:
                     yield (
                         f"the PDF array {key} has {len(submitted_value)} elements; px4fuse "
                         f"wrote {len(redrawn_value)}",
-                        _STRUCTURAL,
+                        _STRUCTURAL_DIFFERENCE,
                     )
                     continue
                 # list.__iter__ does not resolve references to other PDF objects
@@ -231,7 +231,7 @@ class _PdfComparison:
                 yield (
                     f"the PDF entry {key} was changed to {submitted_text!r}; px4fuse wrote "
                     f"{redrawn_text!r}",
-                    _CONTENT,
+                    _CONTENT_DIFFERENCE,
                 )
 
     def _compare_dictionaries(
@@ -249,10 +249,10 @@ class _PdfComparison:
                 yield (
                     f"the PDF contains an entry {shorten_to_line(name, 40)}, which px4fuse does "
                     "not write",
-                    _STRUCTURAL,
+                    _STRUCTURAL_DIFFERENCE,
                 )
             else:
-                yield f"the PDF lacks an entry {shorten_to_line(name, 40)}", _STRUCTURAL
+                yield f"the PDF lacks an entry {shorten_to_line(name, 40)}", _STRUCTURAL_DIFFERENCE
         # the last pair of pairs_to_compare is compared first
         for name in sorted(submitted_keys & redrawn_keys, reverse=True):
             # /Parent of a page refers to all other pages, so it is compared after all pages
@@ -286,7 +286,7 @@ class _PdfComparison:
             return
         filters = resolve_reference(submitted_stream.get("/Filter"))
         if filters not in (None, "/FlateDecode", ["/FlateDecode"]):  # pypdf does not decode JPEG
-            yield f"the compression of the PDF entry {key} is not supported", _STRUCTURAL
+            yield f"the compression of the PDF entry {key} is not supported", _STRUCTURAL_DIFFERENCE
             return
         submitted_data, redrawn_data = submitted_stream.get_data(), redrawn_stream.get_data()
         if submitted_data == redrawn_data or (
@@ -298,9 +298,9 @@ class _PdfComparison:
         if not is_page_content or len(submitted_data) > MAX_SIZE_RATIO_TO_REDRAWN_PAGE * len(
             redrawn_data
         ):
-            yield f"the content of the PDF entry {key} was changed", _CONTENT
+            yield f"the content of the PDF entry {key} was changed", _CONTENT_DIFFERENCE
         elif description := self._describe_operation_difference(submitted_data, redrawn_data):
-            yield description, _CONTENT
+            yield description, _CONTENT_DIFFERENCE
 
     def _describe_operation_difference(
         self, submitted_content: bytes, redrawn_content: bytes
@@ -358,7 +358,9 @@ def _find_ambiguities(pdf: bytes) -> Iterator[PageDifference]:
     """Yield each file structure that PDF programs may interpret differently."""
     end_match = _END_OF_FILE_PATTERN.search(pdf[-1024:])
     if end_match is None:
-        yield PageDifference(0, "the file has bytes after the end of the PDF", _STRUCTURAL)
+        yield PageDifference(
+            0, "the file has bytes after the end of the PDF", _STRUCTURAL_DIFFERENCE
+        )
     elif b"/Linearized" in pdf[:1024]:
         # in a linearised PDF (ISO 32000-1, annex F), the cross-reference table follows the first
         # object, and the end of the file states its position ("startxref"). If both positions
@@ -366,7 +368,7 @@ def _find_ambiguities(pdf: bytes) -> Iterator[PageDifference]:
         first_object_end = pdf.find(b"endobj") + len(b"endobj")
         stated_xref_table_start = int(end_match[1])
         if pdf[first_object_end:stated_xref_table_start].strip():
-            yield PageDifference(0, SECOND_XREF_TABLE_REASON, _STRUCTURAL)
+            yield PageDifference(0, SECOND_XREF_TABLE_REASON, _STRUCTURAL_DIFFERENCE)
 
 
 def _get_page_references(reader: pypdf.PdfReader) -> list[Any]:

@@ -464,11 +464,9 @@ def is_same_text_up_to_rounding(
     if first_text == second_text:
         return True
     # re.split with a group returns texts at even indices, and numbers at odd indices
-    first_texts_and_numbers, second_texts_and_numbers = map(
-        _NUMBER_PATTERN.split, (first_text, second_text)
-    )
-    number_pairs = zip(first_texts_and_numbers[1::2], second_texts_and_numbers[1::2], strict=False)
-    return first_texts_and_numbers[::2] == second_texts_and_numbers[::2] and all(
+    first_text_parts, second_text_parts = map(_NUMBER_PATTERN.split, (first_text, second_text))
+    number_pairs = zip(first_text_parts[1::2], second_text_parts[1::2], strict=False)
+    return first_text_parts[::2] == second_text_parts[::2] and all(
         a == b or is_same_number(a, b) for a, b in number_pairs
     )
 

@@ -18,7 +18,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.filter.kalman import run_kf
 from px4fuse.filter.model import (
     COVARIANCE_COLUMNS,
-    compute_process_noise_per_density,
+    compute_unit_density_process_noise,
     make_symmetric_matrix,
     make_transition_matrix,
 )
@@ -46,7 +46,7 @@ FAULT_SIZE_TOLERANCE_FRACTION = 0.15
 # Maximum deviation (m) of a student's loop closure error from the right value
 CLOSURE_ERROR_TOLERANCE_M = 0.3
 # Minimum fraction of positions rejected by EKF2 for which the student must report rejections
-MIN_REJECTED_FRACTION = 0.005
+MIN_REPORTED_REJECTION_FRACTION = 0.005
 # Minimum size (m) of an EKF2 position reset that the student must report
 MIN_POSITION_RESET_TO_REPORT_M = 0.2
 # Time (s) after the start of the analysed flight in which position resets are ignored: EKF2 resets
@@ -325,7 +325,7 @@ def _find_ekf2_behaviours(
     innovations = comparison.main.ekf2_tracks.innovations
     if (
         not isinstance(innovations, Unavailable)
-        and (innovations["rejected"] > 0).mean() > MIN_REJECTED_FRACTION
+        and (innovations["rejected"] > 0).mean() > MIN_REPORTED_REJECTION_FRACTION
     ):
         has_bad_samples = not kinds.isdisjoint({"nlos", "jump"})
         required.append("rejected outliers" if has_bad_samples else "rejected good samples")
@@ -375,7 +375,7 @@ def compute_numeric_answer(
     if question.kind == "prediction":
         # propagate the covariance without updates: P = F P Fᵀ + Q
         p, f = make_symmetric_matrix(tuple(covariance)), make_transition_matrix(settings.dt_s)
-        q = make_symmetric_matrix(compute_process_noise_per_density(settings.dt_s))
+        q = make_symmetric_matrix(compute_unit_density_process_noise(settings.dt_s))
         q *= settings.sigma_a_m_s2**2 * settings.dt_s
         for _ in range(round(question.question_parameter / settings.dt_s)):
             p = f @ p @ f.T + q

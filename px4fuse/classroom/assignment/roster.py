@@ -30,7 +30,7 @@ MAX_STEM_LENGTH = 48
 WINDOWS_RESERVED_NAMES = {"con", "prn", "aux", "nul"} | {
     f"{n}{i}" for n in ("com", "lpt") for i in range(10)
 }
-TITLES_BY_FIELD = {
+COLUMN_TITLES_BY_FIELD = {
     field_name: titles.split()
     for field_name, titles in read_toml(__file__, dict[str, str], "columns.toml").items()
 }
@@ -191,7 +191,7 @@ def read_people(sheet: Sheet) -> tuple[Person, ...]:
     SettingsError
         No column identifies the students, or two rows have the same id.
     """
-    if all(sheet.find_column_index(titles) is None for titles in TITLES_BY_FIELD.values()):
+    if all(sheet.find_column_index(titles) is None for titles in COLUMN_TITLES_BY_FIELD.values()):
         raise SettingsError(
             f"{sheet.path}: no column contains ids, emails or names of students.",
             "Give one column the title id, email or name.",
@@ -245,7 +245,7 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
     """Return the student in a table row; None for a row without a student."""
     cells = {
         field_name: shorten_to_line(sheet.find_cell(row, titles), MAX_NAME_LENGTH)
-        for field_name, titles in TITLES_BY_FIELD.items()
+        for field_name, titles in COLUMN_TITLES_BY_FIELD.items()
     }
     name = cells["name"] or f"{cells['first']} {cells['last']}".strip()
     if re.sub(r"\W", "", name.casefold()) in NON_STUDENT_ROW_NAMES:

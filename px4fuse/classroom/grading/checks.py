@@ -457,7 +457,7 @@ class TimeOffsetItem(RubricItem, tag="clock"):
 
 
 # Maximum distance (m) between take-off and landing: with a larger distance, a loop closure is wrong
-MAX_LANDING_DISTANCE_M = 0.5
+MAX_TRUE_CLOSURE_ERROR_M = 0.5
 CORRECTED_PATH_NAMES: tuple[CorrectionName, ...] = (
     "by_distance_plain",
     "by_distance",
@@ -476,14 +476,16 @@ class LoopItem(RubricItem, tag="loop"):
 
     def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
         loop = scoring_input.results.loop
-        is_accepted = isinstance(loop, Loop) and any(each.accepted for each in loop.closures)
+        has_accepted_closure = isinstance(loop, Loop) and any(
+            each.accepted for each in loop.closures
+        )
         # the landing place is also known if the report contains no loop
         right_answers = scoring_input.right_answers
         true_values = right_answers.true_values if right_answers else {}
-        landing_distance_m = true_values.get("closure_error_m", 0.0)
-        if landing_distance_m > MAX_LANDING_DISTANCE_M and not is_accepted:
+        true_closure_error_m = true_values.get("closure_error_m", 0.0)
+        if true_closure_error_m > MAX_TRUE_CLOSURE_ERROR_M and not has_accepted_closure:
             return 1.0, (
-                f"Your vehicle landed {format_metres(landing_distance_m)} m from the take-off "
+                f"Your vehicle landed {format_metres(true_closure_error_m)} m from the take-off "
                 "place, so it is right that no loop closure was accepted."
             )
         if not isinstance(loop, Loop) or loop.closure_error_m is None:
@@ -496,7 +498,7 @@ class LoopItem(RubricItem, tag="loop"):
                 "The track in your report does not drift. Analyse odometry, for example LOG:vio."
             )
         points_fraction, comment = 0.25, "No loop closure was accepted."
-        if is_accepted:
+        if has_accepted_closure:
             corrected_paths = map(loop.corrections.get, CORRECTED_PATH_NAMES)
             is_corrected = any(isinstance(path, PathResult) for path in corrected_paths)
             points_fraction = 1.0 if is_corrected else 0.5

@@ -17,7 +17,7 @@ from px4fuse.results.answer_form import form_rows
 
 from ..assignment.roster import format_cell_number
 from .model import (
-    TOTAL_TITLE,
+    TOTAL_POINTS_TITLE,
     Grade,
     GradedReport,
     GradeOverride,
@@ -218,7 +218,7 @@ def _make_points_input_boxes(grade: Grade) -> RowDetailsSection:
         for item in (report.items if report else ())
         if item.is_scored_by_instructor
     }
-    max_points_by_title[TOTAL_TITLE] = grade.max_points
+    max_points_by_title[TOTAL_POINTS_TITLE] = grade.max_points
     rows = []
     for title, max_points in max_points_by_title.items():
         override = grade.overrides.get(title, GradeOverride())

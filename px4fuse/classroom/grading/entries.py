@@ -30,7 +30,7 @@ from ..assignment.roster import (
     read_people,
 )
 from .model import (
-    TOTAL_TITLE,
+    TOTAL_POINTS_TITLE,
     Grade,
     GradedReport,
     GradeOverride,
@@ -290,7 +290,7 @@ def _flag_submission(
             f"{platform} marks the file as late, but states no submission time, so no points were "
             "deducted."
         )
-    if origin.has_forged_platform_name:
+    if origin.has_imitated_platform_name:
         yield (
             "The student chose a file name that only learning platforms give. Check who handed in "
             "the file."
@@ -311,9 +311,9 @@ def _flag_submission(
 def _choose_counted_report(candidates: Sequence[_CandidateReport], course: Course) -> Grade:
     candidates = sorted(candidates, key=lambda each: each.time_s)
     # prefer reports without open decisions of the instructor
-    readable = [each for each in candidates if each.report.version]
-    final = [each for each in readable if not each.report.instructor_action]
-    eligible_candidates = final or readable or candidates
+    readable_reports = [each for each in candidates if each.report.version]
+    final = [each for each in readable_reports if not each.report.instructor_action]
+    eligible_candidates = final or readable_reports or candidates
 
     def rank(candidate: _CandidateReport) -> tuple[float, float, str]:
         points = max(candidate.report.points - candidate.grade.deducted_points, 0.0)
@@ -328,7 +328,7 @@ def _choose_counted_report(candidates: Sequence[_CandidateReport], course: Cours
     # students could hand in several answer forms with different guesses. If the best report counts,
     # flag different forms; otherwise only the forms of the same time compete
     if course.attempt == "best":
-        if len({each.report.form for each in readable}) > 1:
+        if len({each.report.form for each in readable_reports}) > 1:
             flags.append(
                 f"The student handed in {len(candidates)} reports with different answer forms."
             )
@@ -374,7 +374,7 @@ def _apply_overrides(
         if report.counted_points is not None or course.include_pending:
             total_points = round(max(report.points - grade.deducted_points, 0.0), 2)
     report_override = override_by_item_title.get("", GradeOverride())
-    total_override = override_by_item_title.get(TOTAL_TITLE, GradeOverride())
+    total_override = override_by_item_title.get(TOTAL_POINTS_TITLE, GradeOverride())
     return replace(
         grade,
         counted_report=report,
@@ -482,7 +482,7 @@ def match_overrides(
         report = grades[student_index].counted_report
         # titles that the instructor may use ("": comment on the whole report), and maximum points
         max_points_by_title = {
-            TOTAL_TITLE: report.max_points if report else max_points_of_class,
+            TOTAL_POINTS_TITLE: report.max_points if report else max_points_of_class,
             "": math.inf,
         }
         if report:

@@ -116,10 +116,11 @@ def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> 
     """Compare a student's answers with the right answers, and compute the points."""
     is_recognised_as_fault_free = not right_answers.mistakes and answers.declares_no_fault
     # maximum points of each part; with figures, the questions about the flight give a fraction
-    flight_fraction = POINTS_FRACTION_OF_FLIGHT_QUESTIONS if right_answers.choices else 1.0
+    flight_points_fraction = POINTS_FRACTION_OF_FLIGHT_QUESTIONS if right_answers.choices else 1.0
     table_name = "weights_clean" if is_recognised_as_fault_free else "weights"
     weights = {
-        name: flight_fraction * max_points for name, max_points in POINTS_CONFIG[table_name].items()
+        name: flight_points_fraction * max_points
+        for name, max_points in POINTS_CONFIG[table_name].items()
     }
     # score (0 to 1) of each part
     scores = dict.fromkeys(FORM_PART_NAMES, 0.0)
@@ -138,10 +139,10 @@ def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> 
     if right_answers.mistakes and all(fault.size is None for fault in right_answers.mistakes):
         # no injected fault has a size: the points for sizes are given for the right fault names
         points["mistakes"] += weights["sizes"] * scores["mistakes"]
-    deduction = flight_fraction * FALSE_FAULT_DEDUCTION * len(wrongly_named_faults)
+    deduction = flight_points_fraction * FALSE_FAULT_DEDUCTION * len(wrongly_named_faults)
     points["mistakes"] = max(points["mistakes"] - deduction, 0.0)
     if right_answers.choices:
-        weights["figures"] = 100.0 * (1.0 - flight_fraction)
+        weights["figures"] = 100.0 * (1.0 - flight_points_fraction)
         points["figures"] = weights["figures"] * _score_choices(answers, right_answers)
     kinds_named_by_student = [named_fault.kind for named_fault in answers.mistakes]
     feedback = (
@@ -319,8 +320,8 @@ def score_fault_size(fault: InjectedFault, named_fault: NamedFault) -> float:
     if named_fault.kind != fault.kind:
         # if the student names a similar fault instead of the injected fault, a size within the
         # accepted range gives a third of the points. Both sizes need the same unit
-        unit, named_unit = (FAULT_KINDS[each.kind].standard_unit for each in (fault, named_fault))
-        return (fault.low <= stated_size <= fault.high and unit == named_unit) / 3.0
+        unit, stated_unit = (FAULT_KINDS[each.kind].standard_unit for each in (fault, named_fault))
+        return (fault.low <= stated_size <= fault.high and unit == stated_unit) / 3.0
     relative_error = abs(stated_size - fault.size) / abs(fault.size)
     if fault.kind in GUESSABLE_FAULT_KINDS:
         # the score decreases linearly with the distance from the accepted range

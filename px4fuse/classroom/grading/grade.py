@@ -116,7 +116,7 @@ def grade(
 def _grade_submissions(
     found_submissions: Sequence[Submission],
     course: Course,
-    records_folder: Path,
+    verifications_folder: Path,
     processes: int | None,
     progress: Callable[[int, int], None],
 ) -> tuple[list[GradedReport], int]:
@@ -136,7 +136,7 @@ def _grade_submissions(
         course.rubric,
         course.key,
         hash_files(course.logs),
-        records_folder,
+        verifications_folder,
         max_log_bytes.get(),
     )
     report_by_index: dict[int, GradedReport] = {}
@@ -166,7 +166,7 @@ def grade_submission(
     rubric: Rubric,
     answer_key: AnswerKey | None,
     path_by_sha256: PathBySha256,
-    records_folder: Path,
+    verifications_folder: Path,
     max_bytes: int,
     job: tuple[Submission, str],
 ) -> tuple[GradedReport, bool]:
@@ -174,7 +174,7 @@ def grade_submission(
 
     Parameters
     ----------
-    records_folder : Path
+    verifications_folder : Path
         Folder of earlier verifications.
     max_bytes : int
         Maximum size of a log.
@@ -197,7 +197,7 @@ def grade_submission(
         content = submissions.read_submission(submission)
         sha256 = hashlib.sha256(content).hexdigest()
         results, verification, is_loaded_from_cache = load_or_verify(
-            records_folder, content, path_by_sha256, assigned_hashes
+            verifications_folder, content, path_by_sha256, assigned_hashes
         )
     except ResultsError as error:
         graded_report = grade_unreadable_file(rubric, answer_key, f"{error.reason}.", error.remedy)
@@ -227,7 +227,7 @@ class VerificationRecord:
 
 
 def load_or_verify(
-    records_folder: Path,
+    verifications_folder: Path,
     pdf: bytes,
     path_by_sha256: PathBySha256,
     assigned_hashes: frozenset[str],
@@ -236,7 +236,7 @@ def load_or_verify(
 
     Parameters
     ----------
-    records_folder : Path
+    verifications_folder : Path
         Folder of earlier results.
     pdf : bytes
         Content of the submitted file.
@@ -258,10 +258,10 @@ def load_or_verify(
     ResultsError
         The file is not a report.
     """
-    record_path = records_folder / hashlib.sha256(pdf).hexdigest()
-    loaded = _load_verification(record_path, path_by_sha256, assigned_hashes)
-    if loaded is not None:
-        return (*loaded, True)
+    record_path = verifications_folder / hashlib.sha256(pdf).hexdigest()
+    loaded_verification = _load_verification(record_path, path_by_sha256, assigned_hashes)
+    if loaded_verification is not None:
+        return (*loaded_verification, True)
     results = read_report(pdf, "The file")
     versions_and_files = _collect_versions_and_files(
         to_json(results), path_by_sha256, assigned_hashes

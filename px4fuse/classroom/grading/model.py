@@ -11,13 +11,13 @@ from px4fuse.verification.model import Verification
 from ..assignment.roster import Person
 
 # Name of the sum of all points, in overrides.csv and messages
-TOTAL_TITLE = "total"
+TOTAL_POINTS_TITLE = "total"
 
 UNKNOWN_PERSON = Person("")
 
 
 @dataclass(frozen=True)
-class ExportOrigin:
+class SubmissionOrigin:
     """Student and submission time that a learning platform writes into a file name.
 
     Attributes
@@ -30,7 +30,7 @@ class ExportOrigin:
         Submission time; without time zone if the platform omits it.
     is_late : bool
         True if the platform marks the file as late.
-    has_forged_platform_name : bool
+    has_imitated_platform_name : bool
         True if the student's own file name imitates that of a platform.
     """
 
@@ -38,10 +38,10 @@ class ExportOrigin:
     person: Person = UNKNOWN_PERSON
     time: datetime | None = None
     is_late: bool = False
-    has_forged_platform_name: bool = False
+    has_imitated_platform_name: bool = False
 
 
-UNKNOWN_EXPORT_ORIGIN = ExportOrigin()
+UNKNOWN_SUBMISSION_ORIGIN = SubmissionOrigin()
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Submission:
     file: Path
     zip_entry: str
     name: str
-    origin: ExportOrigin = UNKNOWN_EXPORT_ORIGIN
+    origin: SubmissionOrigin = UNKNOWN_SUBMISSION_ORIGIN
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class GradedReport:
     notes: str = field(default="", repr=False)
     did_student_name_fault: Mapping[str, bool] = field(default_factory=dict)
     form_part_scores: tuple[ItemScore, ...] = ()
-    origin: ExportOrigin = UNKNOWN_EXPORT_ORIGIN
+    origin: SubmissionOrigin = UNKNOWN_SUBMISSION_ORIGIN
     redrawn_report_path: str = ""
 
     @property

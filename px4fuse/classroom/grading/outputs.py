@@ -39,7 +39,7 @@ from .checks import shorten_text
 from .class_page import format_class_page
 from .entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
 from .model import (
-    TOTAL_TITLE,
+    TOTAL_POINTS_TITLE,
     Grade,
     GradedReport,
     list_item_titles,
@@ -311,7 +311,7 @@ def feedback_text(grade: Grade, class_name: str = "") -> str:
     Flags are omitted, because they are for the instructor.
     """
     report = grade.counted_report
-    is_total_set_by_instructor = TOTAL_TITLE in grade.overrides
+    is_total_set_by_instructor = TOTAL_POINTS_TITLE in grade.overrides
     lines = [class_name] if class_name else []
     if report is None:
         lines.append("No submission.")

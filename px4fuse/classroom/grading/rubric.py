@@ -40,7 +40,7 @@ from .checks import (
     shorten_text,
 )
 from .form_points import FormPoints
-from .model import TOTAL_TITLE, GradedReport, ItemScore
+from .model import TOTAL_POINTS_TITLE, GradedReport, ItemScore
 
 DEFAULT_RUBRIC = Path(__file__).with_name("rubric.toml")
 MAX_RUBRIC_BYTES = 1_000_000
@@ -104,7 +104,7 @@ class Rubric(Record, kw_only=True):
     )
 
     def __post_init__(self) -> None:
-        titles = [TOTAL_TITLE, *(item.title for item in self.items)]
+        titles = [TOTAL_POINTS_TITLE, *(item.title for item in self.items)]
         for title, unique_title in zip(titles, make_unique(titles), strict=True):
             if title != unique_title:
                 raise ValueError(

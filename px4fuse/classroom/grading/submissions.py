@@ -42,7 +42,7 @@ from px4fuse.verification.model import BAD_VALUE_ERRORS
 from px4fuse.verification.pdf_input import MAX_PDF_BYTES
 
 from ..assignment.roster import Person, make_unique
-from .model import UNKNOWN_EXPORT_ORIGIN, ExportOrigin, Submission
+from .model import UNKNOWN_SUBMISSION_ORIGIN, Submission, SubmissionOrigin
 
 MAX_ZIP_ENTRIES = 10_000
 # Maximum size (bytes) of the central directory of a zip file; zipfile reads it into memory
@@ -116,7 +116,7 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
     """
     notes: list[str] = []
     submission_by_path: dict[tuple[Path, str], Submission] = {}
-    origin_by_submission_number: dict[str, ExportOrigin] = {}
+    origin_by_submission_number: dict[str, SubmissionOrigin] = {}
     ignored_names, zip_count = list[str](), 0
     for path in paths:
         is_zip = path.is_file() and path.name.lower().endswith(".zip")
@@ -158,24 +158,24 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
 
 
 def add_submitters(
-    submissions: Sequence[Submission], origin_by_submission_number: Mapping[str, ExportOrigin]
+    submissions: Sequence[Submission], origin_by_submission_number: Mapping[str, SubmissionOrigin]
 ) -> Iterator[Submission]:
     """Add student and learning platform, found in the file names, to submissions.
 
     ``origin_by_submission_number`` contains students and times from the metadata of Gradescope.
     """
     # files of one export are in the same zip file, or in the same folder
-    exports = [
+    export_locations = [
         submission.file if submission.zip_entry else submission.name.partition("/")[0]
         for submission in submissions
     ]
     # one platform wrote all names of an export, but students may imitate another platform: count
     # the platforms, and then parse the names with the pattern of the most frequent platform only
     platform_counts_by_export: dict[object, Counter[str]] = defaultdict(Counter)
-    for export, submission in zip(exports, submissions, strict=True):
+    for export, submission in zip(export_locations, submissions, strict=True):
         if platform := parse_submission_path(submission.name).platform:
             platform_counts_by_export[export][platform] += 1
-    for export, submission in zip(exports, submissions, strict=True):
+    for export, submission in zip(export_locations, submissions, strict=True):
         # all files of an export are from one learning platform: assume the platform of most file
         # names, because students may imitate file names of another platform
         most_common = platform_counts_by_export[export].most_common(1)
@@ -350,7 +350,7 @@ def _shorten_name(name: str) -> str:
 
 def parse_submission_path(
     name: str, platforms: Iterable[str] = tuple(PATH_PATTERN_BY_PLATFORM)
-) -> ExportOrigin:
+) -> SubmissionOrigin:
     """Return student and submission time from a file path that a learning platform wrote.
 
     >>> parse_submission_path("Doe Jane_4711_assignsubmission_file_/report.pdf").person.name
@@ -377,14 +377,14 @@ def parse_submission_path(
         # Blackboard add it: more matches are forged
         platform_text_count = 1 if platform in ("moodle", "blackboard") else 0
         found_text_count = len(_PLATFORM_TEXT_PATTERN.findall(name))
-        return ExportOrigin(
+        return SubmissionOrigin(
             platform,
             Person("", full_name, login=fields.get("login", ""), numbers=numbers),
             time,
             is_late=bool(fields.get("late")),
-            has_forged_platform_name=found_text_count > platform_text_count,
+            has_imitated_platform_name=found_text_count > platform_text_count,
         )
-    return UNKNOWN_EXPORT_ORIGIN
+    return UNKNOWN_SUBMISSION_ORIGIN
 
 
 def _match_platforms(name: str, platforms: Iterable[str]) -> Iterator[tuple[str, re.Match[str]]]:
@@ -400,7 +400,7 @@ def _match_platforms(name: str, platforms: Iterable[str]) -> Iterator[tuple[str,
         name = name.partition("/")[2]
 
 
-def read_gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
+def read_gradescope_metadata(text: str) -> dict[str, SubmissionOrigin]:
     r"""Read students and times from Gradescope's ``submission_metadata.yml``, by submission number.
 
     Keys with a larger indentation are texts of students, and are not read.
@@ -418,7 +418,7 @@ def read_gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
         )
         person = Person(student_id, name, email, "", {"gradescope": number})
         time = _parse_time(_read_yaml_value(block, "  :created_at"))
-        origins[number] = ExportOrigin("gradescope", person, time)
+        origins[number] = SubmissionOrigin("gradescope", person, time)
     return origins
 
 

@@ -20,7 +20,13 @@ SMALL_ANGLE_RAD = 0.3
 # Power series in theta^2 of f(theta) = (1 - theta/2 cot(theta/2)) / theta^2 and of f'(theta) /
 # theta
 _SQUARE_TERM_FACTOR_COEFFICIENTS = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
-_DERIVATIVE_SERIES_COEFFICIENTS = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
+_SQUARE_TERM_DERIVATIVE_COEFFICIENTS = (
+    1 / 360,
+    1 / 7560,
+    1 / 201600,
+    1 / 5987520,
+    691 / 130767436800,
+)
 
 
 def wrap(angle: Array) -> Array:
@@ -246,6 +252,6 @@ def _compute_square_term_derivative_over_theta(theta: Array) -> Array:
     closed_form_value = -(half_cot_derivative + 2.0 * (1.0 - 0.5 * t / np.tan(0.5 * t)) / t) / t**3
     return np.where(
         theta < SMALL_ANGLE_RAD,
-        polyval(theta * theta, _DERIVATIVE_SERIES_COEFFICIENTS),
+        polyval(theta * theta, _SQUARE_TERM_DERIVATIVE_COEFFICIENTS),
         closed_form_value,
     )
