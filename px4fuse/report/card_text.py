@@ -369,8 +369,8 @@ def format_rerun_note(reruns: Sequence[CardRerun]) -> str:
     if not replay_starts_s:
         return ""
     return (
-        "EKF2 (replay): predictions by px4fuse's model of EKF2. They exclude gaps in the positions "
-        f"and the first {min(replay_starts_s):.0f} s."
+        "EKF2 (replay): predictions by px4fuse's model of EKF2, without gaps in the positions and "
+        f"the first {min(replay_starts_s):.0f} s."
     )
 
 
