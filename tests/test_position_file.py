@@ -398,7 +398,7 @@ def test_position_file_with_two_uwb_tags_requires_body_option(read, name):
     assert "is selected: A1, B2. Choose a" in error_message(read, text)
     assert_track(read(text, body="B2"), rows=slice(1, None, 2))
     assert "is selected: A1, B2" in error_message(read, text, body="C3")
-    assert "only one body, which has no name" in error_message(read, table(PLAIN), body="C3")
+    assert "only one rigid body, without a name" in error_message(read, table(PLAIN), body="C3")
 
 
 # -- the options -----------------------------------------------------------------------------------

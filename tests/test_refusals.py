@@ -215,7 +215,7 @@ REFUSED = {
     "open, and nothing to correct": ("loop s.tum --open --tum o.tum", "the path is not corrected"),
     "from after to": ("loop s.tum --from 50 --to 40", "Change --from or --to"),
     "no such part": ("loop l.ulg:slam", "a flight log contains no trajectory 'slam'"),
-    "part of a trajectory": ("loop s.tum:vio", "s.tum contains only one body, which has no name"),
+    "part of a trajectory": ("loop s.tum:vio", "s.tum contains only one rigid body"),
     "frame of a flight": ("loop l.ulg --frame enu", "--frame is only for trajectory files"),
     "no PDF": ("loop s.tum -o r.txt", "r.txt: the output is a PDF"),
     "path and graph": ("loop s.tum --tum x --g2o x", "two outputs have the same file name"),

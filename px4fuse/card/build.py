@@ -544,7 +544,7 @@ def _explain_differing_verdicts(
         )
     if "source_noise_time_correlated" in finding_ids:
         return (
-            "KF and EKF2 follow position errors that change slowly. Only ground truth shows slow "
+            "KF and EKF2 follow time-correlated position errors. Only ground truth shows these "
             "errors."
         )
     explanation = UNEXPLAINED_DIFFERENCE_TEXT

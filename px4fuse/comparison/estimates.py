@@ -51,7 +51,7 @@ MIN_TELEMETRY_IMU_HZ = 200.0
 MIN_MEASURED_TO_NOMINAL_IMU_RATE_RATIO = 0.98
 IMU_OSCILLATES = Unavailable(
     "low-pass filter of the position source",
-    "the measured acceleration oscillates, so unfiltered positions also look filtered",
+    "the measured acceleration oscillates, so a low-pass filter cannot be recognised",
     "Check the mounting of the autopilot.",
 )
 TELEMETRY_IMU_MESSAGES = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")

@@ -233,8 +233,8 @@ def _set_heading_change(
 # Labels of the corrected paths, by their key in results.json
 CORRECTION_LABELS: Mapping[CorrectionName, str] = {
     "uncorrected": "uncorrected path",
-    "by_distance_plain": "positions corrected in proportion to path length",
-    "by_distance": "positions and headings corrected in proportion to path length",
+    "by_distance_plain": "closure error distributed along the path (positions)",
+    "by_distance": "closure error distributed along the path (positions, headings)",
     "pose_graph_gated": "pose graph with accepted loop closures",
     "pose_graph_gnc": ROBUST_SOLUTION_LABEL,
 }
@@ -257,7 +257,7 @@ def distribute_closure_error_by_distance(
     # The closure between take-off and landing, if any, is the first
     if closures and closures[0].source == LANDING_CLOSURE_SOURCE and not closures[0].accepted:
         closure_error_vector_m = _explain_gate_rejection(
-            "path correction in proportion to path length", closures[0]
+            "distribution of the closure error along the path", closures[0]
         )
     if isinstance(closure_error_vector_m, Unavailable):
         return {"by_distance_plain": closure_error_vector_m, "by_distance": closure_error_vector_m}

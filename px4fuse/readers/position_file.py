@@ -364,7 +364,7 @@ def _select_body(
                 return texts[texts[index] == choose_body(table.file_name, tags, body_name)]
     if body_name is not None and not table.has_only_chosen_body:
         raise LogError(
-            f"{table.file_name} contains only one body, which has no name",
+            f"{table.file_name} contains only one rigid body, without a name",
             "Omit --body, and the name after the colon in FILE:NAME.",
         )
     return texts
