@@ -662,8 +662,8 @@ def slow(gain: float, lag: float, slow_m: float = 0.1) -> TimeCorrelatedNoise:
         np.inf,
         slow_m=slow_m,
         white_m=0.1,
-        likelihood_gain_nats=gain,
-        low_pass_likelihood_gain_nats=lag,
+        gain_nats=gain,
+        low_pass_gain_nats=lag,
     )
 
 
@@ -924,6 +924,13 @@ def test_gap_above_5_intervals_is_not_counted_as_lost_samples() -> None:
     for longest, lost in ((5.0, [4]), (5.1, [])):  # intervals of 0.25 s
         one = at_intervals([1.0] * 20 + [longest], 0.25, clock_map=clock_map())  # type: ignore[list-item]
         assert [each.evidence["lost"] for each in source_intervals.detect_lost_samples(one)] == lost
+
+
+def test_evidence_of_correlated_errors_keeps_its_names() -> None:
+    slow_error = analysis(time_correlated_noise=slow(99.0, 0.0))
+    found = only(source_errors.detect_time_correlated_noise, slow_error)
+    assert (found.evidence["gain_nats"], found.evidence["low_pass_gain_nats"]) == (99.0, 0.0)
+    assert only(source_positions.detect_low_pass, low_pass(9.0, 0.1)).evidence["gain_nats"] == 9.0
 
 
 def test_position_jump_report_contains_count_and_largest_jump() -> None:

@@ -425,7 +425,13 @@ def test_smaller_kf_noise_that_increases_nees_is_not_advised() -> None:
         (fused(0.1), NoiseEstimate(0.3, 0.2, 0.4), {},
          "Set EKF2_EVP_NOISE to 0.3 m. EKF2 used a measurement noise of 0.1 m."),
         (fused(0.1), NoiseEstimate(0.124, 0.12, 0.13), {},
-         "Keep EKF2's measurement noise (0.1 m): it agrees with the estimate."),
+         "Keep EKF2's measurement noise (0.1 m): its estimate (0.12 m) does not explain the wrong"),
+        # EKF2 is overconfident although its noise is larger than the estimate
+        (fused(0.1), NoiseEstimate(0.03, 0.02, 0.04), {},
+         "Keep EKF2's measurement noise (0.1 m): its estimate (0.03 m) does not explain the wrong"),
+        (axis(ekf2=statement(5.0, "overconfident"),
+              ekf2_innovations=pd.DataFrame({"observation_variance_m2": [np.nan]})),
+         NoiseEstimate(0.3, 0.2, 0.4), {}, noises.UNEXPLAINED_SIGMA_ACTION),
         (fused(0.1, 0.2), NoiseEstimate(0.081, 0.08, 0.09), {},
          "Keep EKF2's measurement noise (0.1 m): it"),
         # a smaller noise than the sender reports: its variances must not be used

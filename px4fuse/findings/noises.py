@@ -460,23 +460,23 @@ def _find_sigma_action_without_replay(
     aid, ekf2_summary = find_aid(analysis, result.axis.name), result.filters["ekf2"]
     assert not isinstance(ekf2_summary, Unavailable)
     estimated_noise_m = axis_tuning.sigma_z.value_or_bound(0.0)
-    if not estimated_noise_m:
-        return UNEXPLAINED_SIGMA_ACTION
     noise_m, used_noise_m = max(estimated_noise_m, EKF2_MIN_NOISE_M), find_ekf2_noise_m(result)
+    if not estimated_noise_m or np.isnan(used_noise_m):
+        return UNEXPLAINED_SIGMA_ACTION
     # A change to the estimate corrects an underconfident EKF2 only if it reduces the noise, and an
     # overconfident EKF2 only if it increases the noise. The ratio is then above 1
     is_underconfident = ekf2_summary.sigma_ratio < 1.0
     ratio = used_noise_m / noise_m if is_underconfident else noise_m / used_noise_m
-    if not ratio > MAX_RATIO_OF_EQUAL_NOISES:  # the comparison is False for NaN
+    if ratio <= MAX_RATIO_OF_EQUAL_NOISES:
         return (
-            f"Keep EKF2's measurement noise ({used_noise_m:.2g} m): it agrees with the estimate. "
+            f"Keep EKF2's measurement noise ({used_noise_m:.2g} m): its estimate "
+            f"({noise_m:.2g} m) does not explain the wrong σ. "
             "Check the time offset (px4fuse sync LOG) and the IMU (gaps, vibration)."
         )
     # If EKF2 used more noise than its parameter, it used the variances in the messages. A smaller
     # noise then also requires that EKF2 ignores these variances (make_noise_change)
     parameters, reported_noise_m = analysis.flight.log.parameters, 0.0
     noise_setting_m = parameters.get(aid.noise, np.inf)
-    # If the used noise exceeds the noise parameter, EKF2 used the variances in the messages
     if used_noise_m > MIN_USED_TO_PARAMETER_NOISE_RATIO * noise_setting_m:
         reported_noise_m = used_noise_m
     noise_change = make_noise_change(aid, parameters, reported_noise_m, noise_m)

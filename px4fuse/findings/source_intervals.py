@@ -139,9 +139,9 @@ def _make_source_stops_or_begins_finding(
         finding_id, event, event_s = "source_begins", "begin", end_s
         before_or_after = "before"
         action = "" if source.alignment else " Take off only when positions arrive."
-    # Example: "UWB positions stop in flight at 60.0 s, 20.0 s before the end of the flight. For
-    # 20.0 s EKF2 relied on the IMU alone (dead reckoning). EKF2's position error at 80.0 s is 4.2
-    # m."
+    # Example: "UWB positions stop in flight at 60.0 s, so 20.0 s of the flight have no positions.
+    # For 20.0 s EKF2 relied on the IMU alone (dead reckoning). EKF2's position error at 80.0 s is
+    # 4.2 m."
     ekf2_errors_at_end = _find_ekf2_errors_at_end(analysis, span_s)
     quantity, value_m = "position error", ekf2_errors_at_end.get("error_m")
     if value_m is None:
@@ -205,6 +205,7 @@ def describe_errors_after_gap(analysis: Analysis, gap_span_s: Span) -> str:
     else:
         reference_m = float(axis.measurement_m[np.searchsorted(axis.measurement_time_s, end_s)])
         quantity = "Distance from the estimated to the first measured position after the gap"
+    # 2. EKF2: last logged position before the end of the gap
     ekf2_text, aiding_sentence = "", "In the gap KF relies on the IMU alone."
     if isinstance(ekf2_state, pd.DataFrame) and len(
         positions_before := ekf2_state["position_m"].loc[:end_s]

@@ -71,8 +71,7 @@ def make_time_offset_advice(
 ) -> dict[str, str]:
     """Return sentences on the time offset of the source, by their label in the report.
 
-    The labels are "Result", "Offset", "Action" and "Re-run". ``rerun`` is a re-run of KF with the
-    time offset.
+    "Offset" is always present. ``rerun`` is a re-run of KF with the time offset.
     """
     if isinstance(time_offset, Unavailable):
         reason, remedy = time_offset.reason, time_offset.remedy
