@@ -334,8 +334,8 @@ def _format_rerun_lines(reruns: Sequence[CardRerun]) -> Iterator[Paragraph]:
     headings, *rows = make_rerun_rows(reruns) or [[]]
     for label, *values, result in rows:
         named_values = zip(headings[1:], values, strict=False)  # the last heading is that of result
-        text = ", ".join(f"{heading} {value}" for heading, value in named_values if value)
-        yield _make_labelled_paragraph("re-run", f"{label}: {text}; {result}")
+        texts = [f"{heading} {value}" for heading, value in named_values if value]
+        yield _make_labelled_paragraph("re-run", f"{label}: {', '.join([*texts, result])}")
     yield Paragraph(format_rerun_note(reruns), "  ", "  ")
 
 
