@@ -220,8 +220,8 @@ def _add_barometer(
 ) -> ReplaySegment:
     """Add the barometer samples, which are EKF2's only height source outdoors."""
     down_m = sensors.HOME_POSITION[2] - barometer.fields["baro_alt_meter"].astype(float)
-    # Without ground effect, the dead zone of the innovation is 0. The table contains all samples, so
-    # each of them has the weight 1
+    # Without ground effect, the dead zone of the innovation is 0. The table contains all samples,
+    # so each of them has the weight 1
     samples = pd.DataFrame(
         {"down_m": down_m, "dead_zone_m": 0.0, "weight": 1.0}, measurement_times_s
     )
