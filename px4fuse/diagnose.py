@@ -205,8 +205,8 @@ def refine_delay(comparison: Comparison, time_offset: SourceTimeOffset | Unavail
     # A late source has a positive delay and a negative time offset
     refined_convention = structs.replace(comparison.convention, late_s=-time_offset.offset_s)
     refined_comparison = replace(comparison, convention=refined_convention)
-    # In convention_faults, a delay that is too small to be a fault is 0. The detected delay is
-    # replaced only if detected and refined delay are both faults
+    # convention_faults.late_s is 0 if a delay is too small for a correction. Replace the delay only
+    # if both delays are large enough, so that the fault neither appears nor disappears
     is_late_before_and_after_refinement = (
         comparison.convention_faults.late_s and refined_comparison.convention_faults.late_s
     )

@@ -97,7 +97,8 @@ def _find_file_sizes(file_system: AbstractFileSystem, path: str) -> dict[str, in
         files = file_system.find(path, detail=True)
         files = {name: files[name] for name in files if name.lower().endswith(LOG_SUFFIXES)}
     elif file_system.exists(path):
-        # also a device or pipe, which a worker process rejects with a message
+        # A path that exists, but is no regular file, such as a device or pipe, is also returned.
+        # The process that reads it reports the error
         return {path: file_system.size(path) if file_system.isfile(path) else None}
     else:
         files = file_system.glob(path, detail=True)

@@ -22,8 +22,8 @@ FINDING_SEPARATOR = ";"
 
 
 # Columns of the table of px4fuse batch: rows of columns.csv. A row that contains FILTER is repeated
-# for each filter name. Other rows are repeated too, without effect: the dictionaries below contain
-# each column once
+# with the name of each filter. A row without FILTER is repeated unchanged, and the dictionaries
+# below keep it once
 _COLUMN_DEFINITIONS = [
     {key: text.replace("FILTER", name) for key, text in row.items()}
     for _, rows in groupby(
@@ -133,7 +133,8 @@ def find_first_action(card: DiagnosisCard) -> str:
     for action in actions:
         if action.commands:
             return "\n".join(action.commands)
-        # a change without commands comes first, for example of a sensor: give its text
+        # a change that is not a command, such as a repair of a sensor, comes first: return its
+        # text, not the command of a later action
         if action.changes_something():
             break
     return card.do_this[0] if card.do_this else ""

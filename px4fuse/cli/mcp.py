@@ -124,8 +124,8 @@ def run_command(
     """
     readable_folders.set(folders)
     max_log_bytes.set(max_bytes)
-    # reports are written to reports/ in the current folder. A sender exists only in a worker
-    # process; commands in the server process write no files
+    # the command writes its report to reports/ in the current folder. Only a worker process, which
+    # has a sender, changes its current folder: the server process writes no reports
     if report_folder and sender:
         os.chdir(report_folder)
     output, results_json_texts = io.StringIO(), list[str]()

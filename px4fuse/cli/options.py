@@ -208,8 +208,8 @@ def _make_open_option(*names: str) -> OptionDecorator:
 
 #: Option --open of commands that write a report or a page
 open_option = _make_open_option("--open", "--show", "opened")
-#: Option --show of px4fuse loop. Its --open has another meaning: the path does not return to its
-#: start
+#: Option --show of px4fuse loop. It has no alias --open, because px4fuse loop uses --open for a
+#: flight that does not return to its start
 show_option = _make_open_option("--show", "shown")
 #: Options for the student's name and id, notes and answer form
 student_options = _combine_options(

@@ -245,7 +245,8 @@ def make_result_files(
     """
     from px4fuse.results.contract import to_json
 
-    # before the next step: px4fuse mcp sets --json - if no report may be written
+    # px4fuse mcp gives --json - if it must not write a report. Choose the report path before
+    # json_path "-" is replaced by None below
     if default_stem and output is None and json_path is None:
         output = choose_default_report_path(default_stem, results)
     json_text, contents = to_json(results), dict[Path, bytes]()
@@ -261,7 +262,8 @@ def make_result_files(
         _, results_path = choose_report_paths(output, json_path)
         contents[output] = render_pdf(analysis, results, json_text)
         contents[results_path] = json_text.encode()
-    if json_path is not None:  # a file, or in addition standard output
+    # with -o and --json -, results are written to a file and to standard output
+    if json_path is not None:
         contents[json_path] = json_text.encode()
     return contents
 

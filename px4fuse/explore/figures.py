@@ -64,7 +64,7 @@ BOKEH_SOURCE_COLUMNS = (
     "t p v sp sv "  # t: time (s); p: position (m), v: velocity (m/s); sp, sv: their σ
     "k0 k1 "  # KF gain: k0 of position, k1 of velocity (1/s)
     "e minus plus "  # e: position error (m); minus, plus: limits (m) of its 2σ band
-    "x y marker"  # x: innovation ÷ √S; y: x limited to the plot; marker: arrow head if limited
+    "x y marker"  # x: innovation ÷ √S; y: drawn value (plot edge if x is outside); marker: symbol
 )
 KF_LINE_STYLE: BokehStyle = {"line_width": 1.6, "line_color": KF_COLOUR}
 # Style and name in the tooltip of each line, by its data source

@@ -31,7 +31,8 @@ from px4fuse.simulation.scenario import Scenario
 from .data import ArrayEncoder, make_flight_data
 from .page import make_data_elements, make_page_html
 
-# Pairs of quiz answers whose faults do not hide each other in one flight
+# Pairs of quiz answers: one flight may contain a fault of each answer, because neither fault hides
+# the other
 COMBINABLE_ANSWER_PAIRS = (
     {"clock", "source"},
     {"clock", "gate"},

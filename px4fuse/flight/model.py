@@ -46,8 +46,8 @@ class SourceOrigin(Record):
 
     # Kind of the sensor, inferred from the data
     kind: PositionKind
-    # Data that contain the positions, for example "as received": messages that the autopilot
-    # received
+    # File or logged data from which the positions are read. For example, "as received" means the
+    # messages that the autopilot received
     route: PositionRoute
     # EKF2's aiding source for these positions; None if EKF2 never fuses them
     aid: Aid | None

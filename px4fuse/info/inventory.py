@@ -157,13 +157,14 @@ def list_log_contents(flight: Flight) -> Inventory:
         notes.append("the log ends in flight and does not contain the landing")
     notes += log.notes
     comparison, segment, missing_position_remedy = None, None, ""
-    # The reason is that for the choice of the position source, or that for which KF cannot run
+    # `reason` states why the position source was chosen or, after an error, why KF cannot run
     try:
         comparison = prepare_comparison_inputs(
             flight, ComparisonRequest(log=log.name), keep_positions_as_sent=True
         )
     except Px4FuseError as error:
-        # Options of the command line instead of arguments of the API, without the file name
+        # The error names arguments of the Python API and the log file. Name the options of the
+        # command line instead, and omit the log file
         reason = replace_argument_names(error.reason).removeprefix(f"{log.name}: ")
         missing_position_remedy = replace_argument_names(error.remedy)
         if not isinstance(error, MissingDataError):

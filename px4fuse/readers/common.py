@@ -176,7 +176,8 @@ def classify_invalid_positions(samples: pd.DataFrame, columns: list[str]) -> "pd
     is_number: BoolArray = (np.abs(values) < MAX_VALID_SI_VALUE).all(axis=1)
     reason_by_row[~is_number] = "NaN"
     is_zero: BoolArray = (values == 0.0).all(axis=1)
-    # Distance of 0, 0, 0 from the previous and from the next position
+    # If the valid positions before and after a position of 0, 0, 0 are both far from the origin,
+    # the zeros are no measurement
     positions = pd.DataFrame(np.where((is_number & ~is_zero)[:, None], values, np.nan))
     previous_distance_m = np.linalg.norm(positions.ffill(), axis=1)
     next_distance_m = np.linalg.norm(positions.bfill(), axis=1)

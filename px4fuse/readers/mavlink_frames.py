@@ -231,8 +231,9 @@ def _remove_nested_frames(frames: Int64Array) -> Int64Array:
         # frame | receive time | frame | receive time | frame
         expected_frame_starts = previous_end, previous_end + RECEIVE_TIME_BYTES
         is_expected = frame_start in expected_frame_starts
-        # If no frame has an expected start, bytes were skipped. Otherwise, this frame is
-        # accidental: it begins inside the previous frame or the receive time of the next frame
+        # A frame with another start is kept only if bytes were skipped: then no frame begins at an
+        # expected start. Otherwise, the frame is inside the previous frame, or it is part of a
+        # receive time whose bytes look like a frame by chance
         is_after_skipped_bytes = frame_start >= previous_end and all_frame_starts.isdisjoint(
             expected_frame_starts
         )
@@ -297,8 +298,8 @@ def _count_bytes_outside_frames(
     gap_starts = np.append(0, end_offsets)
     gap_ends = np.append(start_offsets, len(content))
     is_gap = gap_starts < gap_ends
-    # The last gap, after the last frame, is used even if it is empty: after the loop, offset is the
-    # end of the last frame, with a known or unknown message
+    # The loop must end with the bytes after the last frame with a known message, even if there are
+    # none: then `offset` is the end of the last complete frame, and an incomplete frame may follow
     is_gap[-1] = True
     for gap_start, gap_end in zip(
         gap_starts[is_gap].tolist(), gap_ends[is_gap].tolist(), strict=True
@@ -311,7 +312,7 @@ def _count_bytes_outside_frames(
             offset += frame_size_bytes
         byte_count_outside_frames += gap_end - offset
     rest = content[offset:]
-    # No first byte if the file ends before or within the bytes of the receive time
+    # `rest_of_frame` is empty if the file ends within the receive time of the last frame
     rest_of_frame = rest[receive_time_size_bytes:]
     is_last_frame_incomplete = 0 < len(rest) < receive_time_size_bytes + MAX_FRAME_BYTES and (
         not rest_of_frame or rest_of_frame[0] in (MAGIC_BYTE_V1, MAGIC_BYTE_V2)
@@ -342,8 +343,8 @@ def _measure_unknown_frame(
         )
     else:
         return 0
-    # The checksum of each frame with a known message was tested: in a gap between valid frames,
-    # such a frame has an invalid checksum
+    # All valid frames with known messages were found before. A known message id between them
+    # therefore belongs to a frame with an invalid checksum
     is_known = message_id in dialect.mavlink_map
     return 0 if is_known or offset + frame_size_bytes > gap_end else frame_size_bytes
 

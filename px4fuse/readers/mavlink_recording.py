@@ -365,7 +365,8 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
         longest_part = max(parts, key=len)
         longest_part_fraction = len(longest_part) / len(rows)
         rows, boot_times_s = rows[longest_part], boot_times_s[longest_part]
-        # The first and last part also contain the frames before and after all boot times
+        # `rows` are the frames that contain a boot time. If the longest part is the first (last)
+        # one, it also contains all frames before the first (after the last) boot time
         analysed_frame_slice = slice(
             0 if longest_part is parts[0] else int(rows[0]),
             len(frames) if longest_part is parts[-1] else int(rows[-1]) + 1,

@@ -330,8 +330,8 @@ def _fit_timesync(
     """Fit the conversion of sender clock to boot clock by TIMESYNC, as mean of both directions."""
     clock_fits = []
     if len(sender_timesync_replies[0]) >= MIN_TIMESYNC_REPLIES:
-        # fit_clock_line needs the earlier reading first: the request (boot time). The inverse of
-        # its result converts sender time to boot time
+        # fit_clock_line requires the clock that is read first as its first argument: here the boot
+        # clock, whose time is in the request. The inverse line converts sender time to boot time
         clock_fits.append(fit_clock_line(*sender_timesync_replies).inverse())
     if len(autopilot_timesync_replies[0]) >= MIN_TIMESYNC_REPLIES:
         clock_fits.append(fit_clock_line(*autopilot_timesync_replies))

@@ -403,7 +403,8 @@ def _interpret_given_columns(
     given_columns = _find_column_indices(table, given_column_names)
     time_column, *position_columns = given_columns[:4]
     sigma_columns = given_columns[4:]
-    # Other columns have no meaning, except UWB tags and, unless given, σ
+    # Ignore the meaning of columns that the user did not name. Exceptions are UWB tags and, if the
+    # user named no σ columns, σ
     kept_kinds = ("tag",) if sigma_columns else ("tag", "sigma")
     meanings = [
         meaning if index in position_columns or meaning.kind in kept_kinds else ColumnMeaning()
@@ -441,7 +442,8 @@ def _detect_time_column(
     The time of measurement is preferred to the time of recording. If the time column contains whole
     seconds, the nanoseconds of another column are added to it in ``numeric_table``.
     """
-    # Best time column: not mostly empty, then the best kind of time, then not the nanoseconds
+    # Prefer a column of which less than half is empty or 0, then the best kind of time, then
+    # another unit than ns: a column in ns may contain only the fraction of a second
     time_columns = [index for index, column in enumerate(column_meanings) if column.kind == "time"]
     is_mostly_empty = numeric_table[time_columns].fillna(0.0).eq(0.0).mean() >= 0.5
     time_column, *other_time_columns = sorted(

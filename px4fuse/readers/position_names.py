@@ -82,7 +82,8 @@ def read_column_name(name: str) -> ColumnMeaning:
         unit = ""
     elif unit:
         words.pop()
-    # 2. Time and tag: all words must be known
+    # 2. Times, or numbers of UWB tags: the column name contains only words that are known for such
+    # columns
     word_set = {*words}
     is_time = bool(word_set & _WORDS_BY_ROLE["time"]) and word_set <= _TIME_WORDS
     if is_time and unit not in METRES_BY_LENGTH_UNIT:
@@ -94,7 +95,8 @@ def read_column_name(name: str) -> ColumnMeaning:
         return ColumnMeaning("time", unit=unit, time_kind=time_kind)
     if word_set <= _WORDS_BY_ROLE["tag"]:
         return ColumnMeaning("tag")
-    # 3. Position or σ, and axis. Split words such as "px" into position and axis
+    # 3. Positions or their σ: first split words without separator. For example, "px" means position
+    # and axis x
     sigma_and_context_words = _WORDS_BY_ROLE["sigma"] | _WORDS_BY_ROLE["context"]
     split_words: list[str] = []
     for word in words:

@@ -277,14 +277,15 @@ def compute_samples_per_step(
     # 1e-6 compensates rounding errors of the IMU interval
     larger_count = max(int(interval_ratio + 0.5 + 1e-6), 1)
     smaller_count = larger_count - 1
-    # For example: ratio 2.5, counts 3 and 2
+    # If the ratio is near a half-integer such as 2.5, both counts (3 and 2) are possible
     is_ambiguous = (
         abs(interval_ratio + 0.5 - larger_count) < MAX_INTERVAL_RATIO_DISTANCE_FROM_HALF_INTEGER
     )
     samples_between_ends = np.diff(step_ends)
     if not smaller_count or not is_ambiguous or not len(samples_between_ends):
         return larger_count
-    # Not all predictions are logged, so multiples of the count agree too
+    # If the log lacks predictions, the number of IMU samples between two logged predictions is a
+    # multiple of the number in one prediction
     is_larger_count_possible, is_smaller_count_possible = (
         np.mean(samples_between_ends % count == 0.0) > 0.9
         for count in (larger_count, smaller_count)
@@ -424,7 +425,8 @@ def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
     delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     observations = observations.set_axis(observations.index + delay_s)
     field = max(magnetometer, observations, key=len)
-    # Below the rate of fusion, some samples are missing
+    # EKF2 fuses the field at 14 Hz. At a lower logged rate, fused samples are missing, and only the
+    # innovations give the mean field between logged samples
     is_field_log_incomplete = len(field) <= MIN_MAGNETOMETER_HZ * topics.log.duration_s
     if is_field_log_incomplete and Columns.MAGNETIC_FIELD_INNOVATION[0] in observations:
         field = observations

@@ -17,8 +17,8 @@ MAX_TIME_DIFFERENCE_OF_SAME_FIX_S = 0.01
 MAX_DIFFERENCE_FROM_LOGGED_LATITUDE_DEG = 1.0
 # Possible intervals (s) between the fixes of a GNSS receiver: 4 to 20 fixes per second
 CANDIDATE_FIX_INTERVALS_S = np.arange(0.05, 0.26, 0.0005)
-# Maximum deviation (s) of the time between two logged fixes from a multiple of the interval between
-# fixes of the receiver (98th percentile)
+# Times between logged fixes are multiples of the receiver's interval between fixes. Maximum
+# deviation (s) from such multiples, 98th percentile
 MAX_DEVIATION_FROM_INTERVAL_MULTIPLE_S = 0.006
 # Fixes that the log lacks are reconstructed from EKF2's position and innovation. Minimum number of
 # logged fixes to measure the error of reconstructed fixes
@@ -93,8 +93,9 @@ def reconstruct_fixes(
         or isinstance(east_innovations, Unavailable)
     ):
         return empty_result
-    # 1. Time of measurement of each fused fix, known up to the next prediction step. EKF2 fuses a
-    # fix that is older than the fusion horizon at the horizon (RingBuffer.h)
+    # 1. Latest possible time of measurement of each fused fix, from the time of its innovation. If
+    # a fix is older than the fusion horizon, EKF2 fuses it at the horizon (RingBuffer.h), later
+    # than its time of measurement
     delay_beyond_horizon_s = max(0.0, delay_s - ekf2.horizon_s)
     fusion_times_s = north_innovations.index.to_numpy() - delay_beyond_horizon_s
     # 2. Exact time: the receiver sends fixes at multiples of its interval after each logged fix. An
@@ -125,7 +126,8 @@ def reconstruct_fixes(
         },
         index=time_index(fix_times_s),
     )
-    # 4. Logged fixes, 0 intervals after a logged fix, show the error of the reconstruction
+    # 4. The error of the reconstruction is known for logged fixes: an innovation within one
+    # receiver interval after a logged fix belongs to this fix
     is_logged = interval_count == 0.0
     previous_fixes = fixes[reconstructed_fixes.columns].to_numpy()[previous_fix_index]
     position_errors_m = (reconstructed_fixes - previous_fixes)[is_logged].dropna().to_numpy()
@@ -171,7 +173,7 @@ def _estimate_receiver_interval(fix_times_s: Array) -> float | None:
     )
     best_index = np.argmin(np.where(is_near_longest, percentile_98_of_deviation_s, np.inf))
     interval_multiples = np.round(logged_intervals_s / CANDIDATE_FIX_INTERVALS_S[best_index])
-    # Element n: True if the multiple n is frequent in the log
+    # Element n is True if enough of the logged intervals are n times the interval of the receiver
     is_frequent = np.bincount(interval_multiples.astype(int)) >= MIN_LOGGED_INTERVALS_PER_MULTIPLE
     # The interval is known only if two successive multiples (n and n + 1) are frequent. If all
     # frequent multiples had a common divisor, such as 2 and 4, the interval could also be twice as

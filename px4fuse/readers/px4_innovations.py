@@ -291,7 +291,8 @@ def _read_common_topics(
     topics: Topics, aid: Aid, enabled_flag: pd.Series[float] | None
 ) -> AidLog | None:
     """Read the innovations of an aiding source from a topic that contains all aiding sources."""
-    # If the flag cs_mag is logged, the innovation "heading" is that of a field component in gauss
+    # If the log contains the flag cs_mag, the innovation "heading" is not that of an angle, but of
+    # a component of the magnetic field (gauss)
     is_in_gauss = aid.name == "mag_heading" and any(
         "cs_mag" in table for table in topics.tables_of(px4.STATUS_FLAGS_TOPIC)
     )

@@ -488,7 +488,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         # EKF2's topics lack some fields of a fix: copy these fields from the previous fix
         fixes = fixes.assign(altitude_m=fixes["altitude_m"].interpolate("index")).ffill()
     samples = convert_gnss_fixes(fixes, _find_local_origin(topics))
-    # 3. Without such topics, compute the missing fixes from EKF2's innovations
+    # 3. If EKF2's topics contain none of the missing fixes, compute them from EKF2's innovations
     rate_hz = compute_sample_rate_hz(samples)
     notes, is_downsampled = list[str](), rate_hz < MAX_DOWNSAMPLED_HZ
     if is_downsampled:

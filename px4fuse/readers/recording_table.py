@@ -227,7 +227,7 @@ def find_position_table(
     table = table or _find_header_table(file_name, unquoted_text, lines, wanted_names)
     if table is None and not wanted_names:
         table = _find_headerless_table(path, unquoted_text, lines)
-    # Columns that the user names need no meaning
+    # The column names must indicate time and position, unless the user named the columns
     if table is None or not (columns or _has_time_and_position(table.column_names)):
         column_list = ", ".join(map(quote, sorted(wanted_names))) or "time, x, y, z"
         raise LogError(

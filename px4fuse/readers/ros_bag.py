@@ -88,7 +88,8 @@ def read_bag(path: Path, topic: str | None) -> tuple[PositionTable, str, int]:
     sha256 = hashlib.sha256()
     for file in files:
         with file.open("rb") as stream:
-            # Instead of a new hash, use the hash of the files before: one hash of all files
+            # hashlib.file_digest adds the file to the hash that this function returns: the same
+            # hash for all files of the bag
             hashlib.file_digest(stream, lambda: sha256)
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:

@@ -53,7 +53,7 @@ _TRUTH_NAME_PATTERN = re.compile(
 )
 # Number of bytes at the start of a file in which comments are searched
 _COMMENT_SEARCH_BYTES = 4096
-# Coordinate frame of a trajectory, by the possible frames of the position file
+# Coordinate frame of a trajectory if its file allows only one frame (edn: axes of a camera)
 _FRAME_BY_RECORDING_FRAMES: dict[tuple[str, ...], Frame] = {
     ("ned",): "NED",
     ("enu",): "ENU",

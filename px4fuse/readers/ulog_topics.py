@@ -52,7 +52,8 @@ MAX_SAMPLE_TIME_OUTSIDE_IMU_S = 2.0
 ULOG_NOTE_KEY = "px4fuse_note"
 # ULog info message that marks a student assignment
 ULOG_ASSIGNMENT_KEY = "px4fuse_assessed"
-# True for commands of instructors, which show the diagnosis of an assignment
+# True for commands of instructors: they also report the faults in the log of a student assignment.
+# Other commands hide these faults
 shows_diagnosis_of_assignments = ContextVar("shows_diagnosis_of_assignments", default=False)
 # Maximum interval (s) between valid IMU timestamps
 MAX_DATA_GAP_S = 600.0
@@ -174,8 +175,8 @@ class _TolerantULogParser(ULog):  # type: ignore[misc]
     MessageLoggingTagged = staticmethod(_skip_if_short(ULog.MessageLoggingTagged))
 
     def _read_file_data(self, topic_names: Any, read_until: int | None = None) -> None:
-        # A ULog with appended data is read up to the offset read_until. pyulog then counts the
-        # bytes that it reads, so pyulog must also read the samples
+        # If data were appended to the ULog, pyulog stops after it has read `read_until` bytes. It
+        # does not count samples that _ULogContent reads, so it must then read the samples itself
         self._file_handle.parser = None if read_until else self
         super()._read_file_data(topic_names, read_until)
 
@@ -435,8 +436,8 @@ def read_topics(name: str, content: bytes) -> Topics:
     time_origin_us, data_end_us = _find_data_span_us(known_or_all_topic_tables, name)
     logged_values, parameter_changes = _read_parameters(ulog, tables, time_origin_us)
     parameter_values, invalid_parameter_notes = replace_invalid_parameters(logged_values)
-    # pyulog stops at a message whose content is longer than the rest of the file. The file is then
-    # longer than the offset of the last header, and shorter than the end of the last reading
+    # pyulog stops at a message that is longer than the rest of the file. The log is truncated if it
+    # ends within this message: after the start of its header, and before the end of its content
     last_header_offset = content_reader.header_start_offset
     is_truncated = last_header_offset < len(content) < content_reader.read_end_offset
     log = LogInfo(

@@ -31,7 +31,7 @@ CARD_WIDTH = 100  # characters per line
 # Width (characters) of the axis of σ ratios (actual σ ÷ reported σ), without its ends
 SIGMA_RATIO_AXIS_WIDTH = 33
 SIGMA_RATIO_AXIS_INDENT = 57  # characters left of the axis of σ ratios
-TEXT_INDENT = 11  # characters left of a text, which contain its label
+TEXT_INDENT = 11  # width (characters) of the column with the labels of texts
 # Ticks with labels on the axis of σ ratios
 LABELLED_RATIO_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
 SYMBOL_BY_REFERENCE = {"source": "●", "truth": "◆"}
@@ -111,7 +111,7 @@ class Paragraph(NamedTuple):
             return lines
         if not self.plot or len(self.text) + len(self.plot) <= width:
             return [self.text + self.plot]
-        # omit the plot if the line is too narrow
+        # text and plot are too long for one line: return the text only
         return [self.text.rstrip()] if self.text.strip() else []
 
 
@@ -248,7 +248,7 @@ def locate_sigma_ratio(
     fraction = map_ratio_to_axis(ratio)
     return {
         "fraction": fraction,
-        # Name of the symbol: of the reference, or of an arrow for a ratio outside the axis
+        # symbol at the ratio: an arrow if the ratio is outside the axis
         "mark": "below" if fraction < 0.0 else "above" if fraction > 1.0 else reference,
         "band": [map_ratio_to_axis(end) for end in CONSISTENT_SIGMA_RATIOS[reference]],
         "interval": [
@@ -292,8 +292,9 @@ def _format_cause_lines(cause: DiagnosedCause, do_this: str) -> Iterator[Paragra
     is_shortened = len(cause.spans_s) > MAX_LISTED_SPANS
     times_text = " (all times: spans_s in the JSON results)" * is_shortened
     yield _make_labelled_paragraph("when", format_spans(cause.spans_s) + times_text)
-    # An action without alternatives and commands is omitted if ``do_this`` (above the causes)
-    # contains its sentence. There, the first letter can be lowercase, so it is not compared
+    # ``do_this`` is already printed above the causes. Omit an action if ``do_this`` contains its
+    # sentence, unless the action is an alternative (": " in the label) or has commands. The first
+    # letter may differ (lowercase in ``do_this``), so it is not compared
     actions = [
         (label, action)
         for label, action in label_alternatives(cause)

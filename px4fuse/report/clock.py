@@ -95,8 +95,8 @@ def make_time_offset_advice(
             "Offset": estimate_sentence,
             "Action": "Check the timestamps of the ground truth, not of the positions.",
         }
-    # "Result" and "Offset" are always present, "Re-run" only for a significant offset. The other
-    # labels are independent of the result
+    # Only "Result", "Offset" and "Re-run" depend on the significance of the time offset, and only a
+    # significant time offset has a "Re-run"
     advice_by_label = {
         "Result": "The position source has no significant time offset.",
         "Offset": estimate_sentence,

@@ -73,7 +73,8 @@ AIDS_TERMS_NOTE = (
     "√S: standard deviation of an innovation as EKF2 reports it. Source: a sensor that aids EKF2."
 )
 ALL_FINDINGS_TITLE = "All findings"
-# Heights (points) of the map and of each plot: beside the map, and below a map of full page width
+# Heights (points) of the map and of each plot: for plots beside the map, and for plots below a map
+# of full page width
 FIGURE_HEIGHTS_IN_COLUMNS, FIGURE_HEIGHTS_AT_FULL_WIDTH = (190.0, 50.0), (84.0, 64.0)
 # Tracks with a larger ratio of length to width have a map of full page width
 MIN_LENGTH_TO_WIDTH_RATIO_OF_WIDE_MAP = 2.2

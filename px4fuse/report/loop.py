@@ -77,7 +77,8 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
 def _write_page(page: Page, loop: Loop) -> None:
     page.write(_describe_closure_error(loop))
     _write_segment(page, loop)
-    # The first line of the page already states the reason for an unknown true end
+    # The first line of the page already states why the true end of the path is unknown, so this
+    # reason is not repeated
     missing_reasons = (
         f"No {correction.what}: {correction.reason}"
         for correction in loop.corrections.values()

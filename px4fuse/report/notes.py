@@ -47,15 +47,16 @@ def write_markdown(page: Page, notes: str) -> None:
     from markdown_it import MarkdownIt  # noqa: PLC0415
 
     parser = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"])
-    # State between the tokens, which open and close nested elements:
+    # The Markdown parser returns a list of tokens, which open and close nested elements. State
+    # after each token:
     next_item_numbers = list[int]()  # number of the next item in each open list, unused for bullets
     level = 0  # number of open list items and quotes
     marker = ""  # bullet or number of a list item, until it is written beside the first text
-    table_rows = list[list[str]]()  # cells of the open table
-    previous_type = ""  # type of the token before, which opens the element of an inline text
+    table_rows = list[list[str]]()  # rows of the current table, with the text of each cell
+    previous_type = ""  # type of the last token; "heading_open" precedes the text of a heading
     for token in parser.parse(notes):
-        # compute the indent before this token changes the level: an item without text ends here,
-        # and its marker needs the indent of the item
+        # This token can end a list item without text. The marker of the item needs the indent
+        # inside the item, so compute the indent before the token changes the level
         indent = INDENT * min(level, MAX_INDENTS)
         if marker and token.type not in ("paragraph_open", "inline"):
             page.write("", indent=indent, marker=marker)  # the item does not begin with a paragraph

@@ -268,10 +268,12 @@ def select_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
 
     sigmas = (draw_number_between(0.2, 0.45, 2), draw_number_between(0.06, 0.14, 3))
     kinds = [pair[next(random_bytes) % 2] for pair in _QUESTION_KIND_PAIRS]
-    # duration (s) of a prediction, or innovation gate (in √S)
+    # one of the kinds "prediction" and "gate" is always chosen, and it alone uses the parameter:
+    # duration (s) of the prediction, or innovation gate (in √S)
     parameter_range = (1.0, 4.0) if "prediction" in kinds else (0.8, 1.3)
     parameter = draw_number_between(*parameter_range, 1)
-    # the first question is about an early update, where the covariance still changes
+    # the first of the three questions is about one of the updates 2 to 8, in which the covariance
+    # still changes
     update_numbers = (
         2 + next(random_bytes) % 7,
         20 + next(random_bytes) % 130,
@@ -316,7 +318,7 @@ def _describe_error(error: Exception, form_toml: str, form_values: dict[str, Any
     # error of msgspec, such as "Expected `str`, got `int` - at `$.mistakes[0].kind`"
     reason, _, path = message.partition(" - at `$.")
     names = re.findall(r"\w+", path)
-    if not names:  # error of check_answers
+    if not names:  # error of check_answers: the message already names the answer
         return message
     invalid_value: Any = form_values
     for name in names:

@@ -121,7 +121,8 @@ def _drop_invalid_values(
                     if field.name not in text_fields and hasattr(value, field.name)
                 }
                 return unavailable_type(**text_fields, **kept_fields)
-        # otherwise, the caller removes the value
+        # this field has no place for a reason: the caller removes the value, or the record around
+        # it
         raise
     return value
 
@@ -163,8 +164,8 @@ def _drop_invalid_entries(
             )
         except _OutOfBoundsError as error:
             errors.append(error)
-    # a mapping that must not be empty (Meta(min_length=1)), such as the axes, is not valid as a
-    # whole
+    # if all entries are invalid, a mapping that must not be empty (Meta(min_length=1)), for example
+    # that of the axes, is invalid too
     metadata = get_args(annotation)[1:]
     if value and not checked_elements and any(getattr(meta, "min_length", 0) for meta in metadata):
         raise errors[-1]

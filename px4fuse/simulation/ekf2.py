@@ -157,7 +157,7 @@ def simulate_ekf2(
     ``imu``, ``source`` and ``other_sensors`` contain all samples, also those that are not logged.
     """
     aid = scenario.aid
-    # 1. Prediction steps, and the sensors for height and heading
+    # 1. Inputs of the EKF2 model in each prediction step: IMU, magnetometer and barometer
     segment = _make_segment(scenario, faults, motion, imu)
     # The log contains float32 values
     logged_values = {name: float(np.float32(value)) for name, value in log_parameters.items()}
@@ -220,7 +220,8 @@ def _add_barometer(
 ) -> ReplaySegment:
     """Add the barometer samples, which are EKF2's only height source outdoors."""
     down_m = sensors.HOME_POSITION[2] - barometer.fields["baro_alt_meter"].astype(float)
-    # No ground effect; each sample represents itself only
+    # Without ground effect, the dead zone of the innovation is 0. The table contains all samples,
+    # so each of them has the weight 1
     samples = pd.DataFrame(
         {"down_m": down_m, "dead_zone_m": 0.0, "weight": 1.0}, measurement_times_s
     )
@@ -417,8 +418,9 @@ def _hold_position_without_aiding(
     has_recent_position_aiding = (
         compute_time_since_last_event_s(time_s, aiding_steps, 0.0) <= NO_AID_TIMEOUT_S
     )
-    # Hold the position of the last step with recent aiding, at rest. The steps without aiding are
-    # replaced by 0, so that the running maximum is the last step with aiding
+    # Without recent aiding, hold the position of the last step with aiding, and set the velocity to
+    # 0. The running maximum of the step numbers, with 0 for steps without aiding, is the last step
+    # with aiding
     last_step_with_aiding = np.maximum.accumulate(
         np.arange(len(time_s)) * has_recent_position_aiding
     )

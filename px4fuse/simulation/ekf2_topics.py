@@ -192,7 +192,7 @@ def _make_position_aid_topics(
     model_inputs: ReplayInputs, model_run: SegmentRun, ekf2_output: Ekf2Output, rate_hz: float
 ) -> tuple[Topic, ...]:
     """Make estimator_aid_src_* of the position source, with one message per usable position."""
-    # Last index 0 of the arrays of model_run: its only filter configuration
+    # The simulation runs one filter configuration, so its index in the arrays of model_run is 0
     events, positions = model_run.events[0], model_inputs.received_positions
     # select events with a position that EKF2 can use: in a gap, an event has no position, and a
     # position may arrive too late
@@ -218,7 +218,7 @@ def _make_position_aid_topics(
     last_fused_us = np.maximum.accumulate(
         is_used * (FIRST_TIMESTAMP_US + ekf2_output.time_us[logged_steps])
     )
-    # Outdoors, v1.16 logs latitude and longitude
+    # For GNSS positions, PX4 v1.16 logs latitude and longitude instead of north and east
     observation = measured_m
     if positions.velocity_m_s is not None:
         north_m, east_m = measured_m.T
@@ -264,8 +264,8 @@ def _make_barometer_topics(
     height_samples, end_step = model_run.segment.height_samples, model_run.events[0].end_step
     if height_samples is None or model_run.height_filter is None:
         return []
-    # Updates of the first configuration. The table copies the times of the events to the column
-    # fused_at_s. With step numbers instead of times, this column contains step numbers
+    # make_update_table copies its last argument, the time of each fusion event, to the column
+    # fused_at_s. Give step numbers as times, because the steps are needed below
     updates = model_run.height_filter.make_update_table(BAROMETER.name, 0, end_step.astype(float))
     last_published_step = len(ekf2_output.time_us) - ekf2_output.lag_steps - 1
     # EKF2 does not log the first sample, which only initialises the height
@@ -381,7 +381,8 @@ def _make_flags_topic(
 ) -> Topic:
     """Return estimator_status_flags: a message each second, and at each start or end of fusion."""
     events, time_s = model_run.events[0], model_run.segment.time_s
-    # A rejected position is an attempt too: the flag stays set during rejections
+    # A rejected position also counts as an attempt to fuse: EKF2 keeps the flag cs_ev_pos or
+    # cs_gnss_pos set while it rejects positions
     attempt_steps = events.end_step[
         model_run.fused[:, 0] | model_run.rejected[:, 0] | model_run.reset[:, 0]
     ]

@@ -93,7 +93,8 @@ class Sines:
 
         The result contains ``array_count`` arrays with the shape (times, axes).
         """
-        # Shapes for m sines: basis (t, 2m), with sin and cos of each angle; amplitudes (2m, k)
+        # Shapes for t times, m sines and k axes: basis (t, 2m), with sin and cos of each angle;
+        # amplitudes (2m, k)
         angle = np.outer(time_s, self.angular_frequency_rad_s)
         basis = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
         amplitudes = [np.concatenate([self.sine, self.cosine])]
@@ -102,7 +103,7 @@ class Sines:
             # d/dt (s sin ωt + c cos ωt) = -ωc sin ωt + ωs cos ωt
             sine, cosine = np.split(amplitudes[-1], 2)
             amplitudes.append(np.concatenate([-omega * cosine, omega * sine]))
-        # One product for all derivatives: (t, 2m) · (2m, array_count · k)
+        # One matrix product gives the values and all derivatives
         return np.split(basis @ np.hstack(amplitudes), array_count, axis=1)
 
 
@@ -201,8 +202,9 @@ def compute_attitude_and_imu(state: TrueState) -> AttitudeAndImu:
         np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
         for angle in (state.yaw_rad, state.yaw_rad + np.pi / 2.0)
     )
-    # y has the direction u = z × forward direction. The forward direction turns to the right with
-    # the yaw rate, so du/dt = dz/dt × forward direction + yaw rate · z × right direction
+    # Body y is the unit vector of u = z × f, with the horizontal forward direction f. The yaw rate
+    # turns f to the right, so df/dt = yaw rate · right direction. By the product rule, du/dt =
+    # dz/dt × f + yaw rate · z × right direction
     unnormalised_y = np.cross(z, forward_direction)
     unnormalised_y_derivative_per_s = np.cross(
         body_z_derivative_per_s, forward_direction
@@ -210,9 +212,9 @@ def compute_attitude_and_imu(state: TrueState) -> AttitudeAndImu:
     unnormalised_y_length = np.sqrt(_dot(unnormalised_y, unnormalised_y))
     y = unnormalised_y / unnormalised_y_length[:, None]
     x = np.cross(y, z)
-    # Angular rate ω in body axes. A body axis e moves with de/dt = ω × e, so ω_x = -y · dz/dt,
-    # ω_y = x · dz/dt and ω_z = -x · dy/dt. Along x, dy/dt is du/dt / |u|, because x is
-    # perpendicular to u
+    # Each body axis e moves with de/dt = ω × e, so the angular rate in body axes is ω_x = -y ·
+    # dz/dt, ω_y = x · dz/dt and ω_z = -x · dy/dt. Since x is perpendicular to y = u/|u|, x · dy/dt
+    # = x · du/dt / |u|
     rate_rad_s = np.stack(
         [
             -_dot(body_z_derivative_per_s, y),
@@ -311,8 +313,8 @@ def _plan_aisle_passes(flight_plan: _FlightBuilder, scenario: Scenario, speed_m_
     flight_plan.ramp_centre_s += SPEED_RAMP_DURATION_S / 2.0
     for pass_index in range(scenario.passes):
         pass_velocity_m_s = velocity_m_s if pass_index % 2 == 0 else -velocity_m_s
-        # Time between the centres of start and stop. Not speed_m_s, because it is 0 without motion:
-        # the vehicle then hovers for the same time
+        # Time between the centres of the start ramp and of the stop ramp. speed_m_s would not give
+        # it, because it is 0 for a flight without motion: the vehicle then hovers for this time
         flight_plan.add_velocity_change(
             pass_velocity_m_s, SPEED_RAMP_DURATION_S, scenario.length_m / scenario.speed_m_s
         )
@@ -347,8 +349,8 @@ def _plan_square_laps(
             flight_plan.yaw_ramps.append((turn_start_s, CORNER_DURATION_S, np.array([np.pi / 2.0])))
         is_last_side = side_index == side_count - 1
         side_length_m = scenario.length_m - (open_end_m if is_last_side else 0.0)
-        # without motion, the velocity is 0, but a side lasts as long as at the speed of the
-        # scenario
+        # velocity_m_s is 0 for a flight without motion. The duration of a side is therefore
+        # computed from the speed of the scenario
         flight_plan.add_velocity_change(
             velocity_m_s - previous_velocity_m_s,
             ramp_duration_s,

@@ -43,8 +43,8 @@ from .pdf_input import (
 COORDINATE_TOLERANCE_PT = 0.25
 # Tolerance of PDF numbers except coordinates: programs may save 32-bit floats
 PDF_NUMBER_TOLERANCE = 1e-5
-# Rounded numbers in a submitted PDF may differ only if the kerning (1/1000 em) is below this limit:
-# a larger kerning could display the digits in another order
+# Maximum kerning (1/1000 em) of a text in a submitted PDF in which a number may be rounded to
+# another last digit: a larger kerning could display the digits in another order
 MAX_KERNING_PER_MILLE_EM = 200.0
 # Maximum size of a page's content in the submitted PDF ÷ in the redrawn PDF (generated again by
 # px4fuse). Escape sequences need four bytes per character
@@ -175,7 +175,8 @@ class _PdfComparison:
             self.fonts = resolve_reference(redrawn_page.get_object()["/Resources"].get("/Font", {}))
             for difference in self._compare((submitted_page, redrawn_page, "/Page")):
                 yield PageDifference(page_number, *difference)
-        # the comparison of pages and of these pairs may append further pairs
+        # compare document information, catalogue and parents of pages last. The comparison of the
+        # catalogue may append further parents to the list
         for pair in self.deferred_pairs:
             for difference in self._compare(pair):
                 yield PageDifference(0, *difference)
@@ -323,10 +324,11 @@ class _PdfComparison:
                 return f"PDF drawing operation {number} ({operator_text}) was changed"
             submitted_text = self._decode_text(submitted_operands, font_name)
             redrawn_text = self._decode_text(redrawn_operands, font_name)
-            # numbers between the parts of a text move the next part
+            # the operator TJ prints several strings, and a number between two strings (kerning)
+            # moves the second string
             kerning = [abs(value) for value in submitted_operands if isinstance(value, float)]
-            # tolerate only a text with another last digit of a number. If the texts are equal, the
-            # operations differ in the kerning
+            # tolerate a difference only if a number was rounded to another last digit. Equal texts
+            # differ in their kerning, which is not tolerated
             if (
                 submitted_text == redrawn_text
                 or max(kerning, default=0.0) >= MAX_KERNING_PER_MILLE_EM
@@ -427,7 +429,7 @@ def _parse_drawing_operations(content: bytes) -> Iterator[Operation]:
         else:
             yield token, tuple(operands)
             operands.clear()
-    # operands at the end of a content stream, without an operator, are compared too
+    # return operands after the last operator too, so that they are compared
     yield "", tuple(operands)
 
 

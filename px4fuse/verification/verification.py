@@ -383,7 +383,8 @@ def compare_results(
             non_number_paths.append(path)
             continue
         is_estimated = has_estimated_settings or path.startswith(ESTIMATE_FIELDS)
-        # numbers agree within a tolerance, and may be equal
+        # collect the numbers that agree within the tolerance, but are not equal: the texts below
+        # may contain them with different digits
         if not _is_within_tolerance(path, recorded_value, new_value, is_estimated):
             mismatched_paths.append(path)
         elif recorded_value != new_value:

@@ -149,7 +149,7 @@ def write_assignment(
         log, answer = simulate_assigned_flight(
             secret, student, kind, fault_count, with_ground_truth
         )
-        # a student of the answer key keeps the stored answer
+        # if the answer key already contains the right answers for this student, keep them
         stored_answer = answers.setdefault(normalise_text(student.student_id), answer)
         _require_answer_key_of_same_flights(key_file, stored_answer.sha256 == answer.sha256)
         log_file = folder / student.log_file_name

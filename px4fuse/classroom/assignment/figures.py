@@ -34,8 +34,8 @@ QUESTIONS = {
 }
 
 
-# Right answers about a flight with one fault by key of the question, and the value of
-# ``px4fuse simulate --mistake`` for this fault ("mistake_option")
+# For each kind of fault: right answers about a flight with this fault, by key of QUESTIONS.
+# "mistake_option" is the value of ``px4fuse simulate --mistake`` that injects the fault
 FIGURE_ANSWERS_BY_FAULT = read_toml(__file__, dict[str, dict[str, str]])
 
 

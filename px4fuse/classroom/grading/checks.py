@@ -433,7 +433,8 @@ class TimeOffsetItem(RubricItem, tag="clock"):
             # assigned flight, so they get full points
             if scoring_input.right_answers is not None:
                 return 1.0, statement
-            # an own flight: no points without an estimate, for example if the log has no IMU data
+            # the flight is the student's own: without any estimate, for example because the log has
+            # no IMU data, the student gets no points
             return self.undeterminable if isinstance(clock, SourceTimeOffset) else 0.0, statement
         (low, high), applied_offset_s = clock.interval_s, clock.applied_s
         statement = (
@@ -479,7 +480,8 @@ class LoopItem(RubricItem, tag="loop"):
         has_accepted_closure = isinstance(loop, Loop) and any(
             each.accepted for each in loop.closures
         )
-        # the landing place is also known if the report contains no loop
+        # the true closure error of an assigned flight is known from the answer key, so the student
+        # can get points even if the report contains no loop
         right_answers = scoring_input.right_answers
         true_values = right_answers.true_values if right_answers else {}
         true_closure_error_m = true_values.get("closure_error_m", 0.0)

@@ -325,8 +325,9 @@ def _choose_counted_report(candidates: Sequence[_CandidateReport], course: Cours
 
     chosen = max(eligible_candidates, key=rank)
     report, flags = chosen.report, list(chosen.grade.flags)
-    # students could hand in several answer forms with different guesses. If the best report counts,
-    # flag different forms; otherwise only the forms of the same time compete
+    # a student could hand in several answer forms with different guesses to get the points of the
+    # best form. If the best report counts, all forms compete; otherwise only the forms that were
+    # handed in at the same time compete
     if course.attempt == "best":
         if len({each.report.form for each in readable_reports}) > 1:
             flags.append(

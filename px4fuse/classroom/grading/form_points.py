@@ -115,7 +115,8 @@ class FormPoints:
 def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> FormPoints:
     """Compare a student's answers with the right answers, and compute the points."""
     is_recognised_as_fault_free = not right_answers.mistakes and answers.declares_no_fault
-    # maximum points of each part; with figures, the questions about the flight give a fraction
+    # if the form also has questions about the figures of other flights, the questions about the
+    # student's own flight give only a fraction of the points
     flight_points_fraction = POINTS_FRACTION_OF_FLIGHT_QUESTIONS if right_answers.choices else 1.0
     table_name = "weights_clean" if is_recognised_as_fault_free else "weights"
     weights = {
@@ -299,8 +300,9 @@ def _score_faults(matches: list[FaultMatch], right_answers: CorrectFormAnswers) 
         # plot give half of the points
         if named_fault.kind != fault.kind:
             evidence_score *= 0.5
-        # a fault in GUESSABLE_FAULT_KINDS can be guessed, and its time, plot and correction follow
-        # from its name. The points for them therefore depend on the stated size
+        # students can guess the names of faults in GUESSABLE_FAULT_KINDS. The right time, plot and
+        # correction follow from the name, so their scores are multiplied by the score for the
+        # stated size
         if fault.kind in GUESSABLE_FAULT_KINDS:
             evidence_score *= size_score
             correction_score *= size_score
@@ -396,7 +398,8 @@ def find_accepted_corrections(
     size, lower_bound, upper_bound = (value or 0.0 for value in (fault.size, fault.low, fault.high))
     fault_start_s = fault.from_s or 0.0
     fault_end_s = fault_start_s if fault.until_s is None else fault.until_s
-    # ranges that the column right_value_range of corrections.csv names
+    # ranges of right parameter values. The column right_value_range of corrections.csv refers to
+    # them by name
     range_by_name = {
         "": NO_BOUNDS,
         # value that cancels the fault
@@ -404,14 +407,14 @@ def find_accepted_corrections(
         "size": (lower_bound, upper_bound),
         # delay (ms) for a time offset (s)
         "late milliseconds": (1e3 * lower_bound, 1e3 * upper_bound),
-        # the student must increase a rate to at least twice the injected value
+        # IMU log rate (Hz): at least twice the injected rate, which is too low
         "twice": (2.0 * size, 1e4),
-        # factors on the distances that correct a scale error in per cent
+        # scale factors that correct distances that are wrong by a scale factor error (per cent)
         "factors": (100.0 / (100.0 + upper_bound), 100.0 / (100.0 + lower_bound)),
-        # position noise that gives the verdict "consistent": 0.8 to 1.25 times the true noise
+        # measurement noise σ (m): with 0.8 to 1.25 times the true σ, a filter is consistent
         "noise": (0.8 * right_answers.sigma_z_m, 1.25 * right_answers.sigma_z_m),
-        # start ("after") or end ("before") of an analysis that excludes the fault: it may contain 1
-        # s of the fault, or exclude up to 15 s without the fault
+        # start time ("after") or end time ("before") of an analysis that excludes the fault. The
+        # analysis may contain up to 1 s of the fault, or omit up to 15 s of data without the fault
         "after": (fault_end_s - 1.0, fault_end_s + 15.0),
         "before": (fault_start_s - 15.0, fault_start_s + 1.0),
     }
@@ -444,7 +447,7 @@ def _score_ekf2_behaviour(answers: Answers, right_answers: CorrectFormAnswers) -
     false_count = len(stated - right)
     if not right or false_count > 1:
         return 0.0
-    # an allowed behaviour also counts as the only required one
+    # if only one behaviour is required, an allowed behaviour (ekf2_did_also) may replace it
     is_complete = required <= stated or len(required) == 1
     return 1.0 if is_complete and not false_count else 0.5
 

@@ -267,9 +267,9 @@ def load_or_verify(
         to_json(results), path_by_sha256, assigned_hashes
     )
     if versions_and_files.get(log_sha256(results)) == "assigned":
-        # the report is about an assigned log that was not given to this command. Without any log,
-        # verify() returns "cannot verify" instead of "other log", which would be the student's
-        # fault
+        # the instructor did not give the log that was assigned to the student. Given other logs,
+        # verify() would return "other log", which means that the student analysed a wrong log.
+        # Given no log, it returns "cannot verify"
         path_by_sha256 = {}
     verification, diagnosis_pdf = verify(results, pdf, path_by_sha256), b""
     if verification.status == "verified" and log_sha256(results) in assigned_hashes:

@@ -156,7 +156,8 @@ def write_grading_files(
         contents[f"{GRADES_FOLDER}/{name}"] = filled_sheet.content()
         notes += sheet_notes
     write_output_files({output / name: content for name, content in contents.items()})
-    # list each file or folder of the output folder once; overrides.csv existed, or is new
+    # overrides.csv is listed in any case: it was written now, or it existed before. dict.fromkeys
+    # removes repeated folders
     written_names = [*contents, OVERRIDES_NAME]
     if has_redrawn_reports:
         written_names.append(REPORTS_FOLDER)
