@@ -266,9 +266,9 @@ def test_position_jump_size_at_source_reset_ignores_time_offset() -> None:
 
 def test_late_positions_are_not_reported_as_low_pass_filtered() -> None:
     late = flown("clock-offset=250ms", passes=6)
-    assert late.source_low_pass.likelihood_gain_nats == 0.0
+    assert late.source_low_pass.gain_nats == 0.0
     _, low_pass, _ = _fit_source_errors(late, late.tuning, unavailable("clock offset"), None, {})
-    assert low_pass.likelihood_gain_nats > 3.0
+    assert low_pass.gain_nats > 3.0
 
 
 # ------------------------------------------------------------------ arrival times

@@ -147,8 +147,8 @@ def test_correlated_noise_is_not_reported_as_low_pass_filtering() -> None:
     assert "source_low_pass_filtered" in root_findings(smooth)
     for analysis, lags in ((slow, False), (smooth, True)):
         found = analysis.time_correlated_noise
-        assert found.likelihood_gain_nats > 30.0
-        assert (found.low_pass_likelihood_gain_nats > 1.0) == lags
+        assert found.gain_nats > 30.0
+        assert (found.low_pass_gain_nats > 1.0) == lags
         assert found.slow_m >= found.white_m
 
 

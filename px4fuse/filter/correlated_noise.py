@@ -95,7 +95,7 @@ class SourceLowPass:
         Correlation of the noise of successive positions; 0 for no filter.
     lag_s : float
         Lag of the positions at constant velocity.
-    likelihood_gain_nats : float
+    gain_nats : float
         Log likelihood (nats) of the innovations with the low-pass filter, minus their log
         likelihood with white noise only.
     sigma_z_m : float
@@ -104,7 +104,7 @@ class SourceLowPass:
 
     correlation: float
     lag_s: float
-    likelihood_gain_nats: float
+    gain_nats: float
     sigma_z_m: float
 
 
@@ -118,9 +118,9 @@ class TimeCorrelatedNoise:
         Correlation time, and the ends of its 95 % interval.
     slow_m, white_m : float
         Standard deviation of time-correlated (slow) and of white noise, per axis.
-    likelihood_gain_nats : float
+    gain_nats : float
         Log likelihood (nats) with time-correlated noise minus log likelihood with white noise.
-    low_pass_likelihood_gain_nats : float
+    low_pass_gain_nats : float
         Log likelihood (nats) with a low-pass filter instead, minus log likelihood with
         time-correlated noise.
     """
@@ -130,8 +130,8 @@ class TimeCorrelatedNoise:
     high_s: float
     slow_m: float
     white_m: float
-    likelihood_gain_nats: float
-    low_pass_likelihood_gain_nats: float
+    gain_nats: float
+    low_pass_gain_nats: float
 
 
 # Unfiltered positions are the positions before the low-pass filter of the source. First: unfiltered
@@ -261,9 +261,7 @@ def fit_time_correlation(
         return imu_motion
     tested_offsets_s = sorted({0.0, clock_offset_s})
     sigma_z_m = noise_parameters.sigma_z_m
-    no_low_pass = SourceLowPass(
-        correlation=0.0, lag_s=0.0, likelihood_gain_nats=0.0, sigma_z_m=sigma_z_m
-    )
+    no_low_pass = SourceLowPass(correlation=0.0, lag_s=0.0, gain_nats=0.0, sigma_z_m=sigma_z_m)
     no_correlation_found = Unavailable(
         "time-correlated noise of the positions", "the position errors are not time-correlated", ""
     )
@@ -310,7 +308,7 @@ def fit_time_correlation(
         white_noise_fit.noise_parameters,
         white_noise_score,
     )
-    source_low_pass = low_pass if low_pass.likelihood_gain_nats > 0.0 else no_low_pass
+    source_low_pass = low_pass if low_pass.gain_nats > 0.0 else no_low_pass
     if not is_correlated:
         return source_low_pass, no_correlation_found
     # Both gains are relative to white noise, so their difference compares low pass and correlated
@@ -322,8 +320,8 @@ def fit_time_correlation(
         high_s=np.inf,
         slow_m=fitted_parameters.correlated_sigma_m,
         white_m=fitted_parameters.sigma_z_m,
-        likelihood_gain_nats=likelihood_gain_nats,
-        low_pass_likelihood_gain_nats=low_pass.likelihood_gain_nats
+        gain_nats=likelihood_gain_nats,
+        low_pass_gain_nats=low_pass.gain_nats
         - likelihood_gain_nats
         + (TIME_OFFSET_PENALTY_NATS if offset_s else 0.0),
     )
@@ -347,12 +345,12 @@ def fit_time_correlation_to_truth(
     tested τ and f, the most likely σ² is known in closed form.
     """
     min_likelihood_gain_nats = MIN_TRUTH_LIKELIHOOD_GAIN_NATS
-    low_pass_likelihood_gain_nats = low_pass.likelihood_gain_nats
+    low_pass_likelihood_gain_nats = low_pass.gain_nats
     if isinstance(correlated_noise_from_imu, TimeCorrelatedNoise):
         min_likelihood_gain_nats = max(
-            MIN_TRUTH_LIKELIHOOD_GAIN_NATS, correlated_noise_from_imu.likelihood_gain_nats
+            MIN_TRUTH_LIKELIHOOD_GAIN_NATS, correlated_noise_from_imu.gain_nats
         )
-        low_pass_likelihood_gain_nats = correlated_noise_from_imu.low_pass_likelihood_gain_nats
+        low_pass_likelihood_gain_nats = correlated_noise_from_imu.low_pass_gain_nats
     # 1. Positions near a sample of ground truth, without outliers, downsampled
     true_track = pd.concat([truth["position_m"] for truth in truths], axis=1).dropna()
     measurement_time_s = np.setdiff1d(axes[0].measurement_time_s, outlier_time_s)
@@ -453,8 +451,8 @@ def fit_time_correlation_to_truth(
         high_s=taus_s[last_tau_index + 1],
         slow_m=(variance_m2 * fraction) ** 0.5,
         white_m=(variance_m2 * (1.0 - fraction)) ** 0.5,
-        likelihood_gain_nats=float(best_gain_nats),
-        low_pass_likelihood_gain_nats=low_pass_likelihood_gain_nats,
+        gain_nats=float(best_gain_nats),
+        low_pass_gain_nats=low_pass_likelihood_gain_nats,
     )
 
 

@@ -114,10 +114,10 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     noise = analysis.time_correlated_noise
     if (
         not isinstance(noise, TimeCorrelatedNoise)
-        or noise.likelihood_gain_nats < MIN_CORRELATED_NOISE_LOG_LIKELIHOOD_RATIO_NATS
+        or noise.gain_nats < MIN_CORRELATED_NOISE_LOG_LIKELIHOOD_RATIO_NATS
         or noise.slow_m < MIN_CORRELATED_NOISE_SIGMA_M
         # A low-pass filter explains the correlated position errors: source_positions.py reports it
-        or noise.low_pass_likelihood_gain_nats >= MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS
+        or noise.low_pass_gain_nats >= MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS
     ):
         return
     correlation_time_text = f"at least {format_number(noise.low_s, 1)} s (95 %)"

@@ -159,7 +159,7 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     # A low-pass filter must fit better than white noise, and have a relevant lag
     if (
         isinstance(low_pass, Unavailable)
-        or low_pass.likelihood_gain_nats < MIN_LOW_PASS_LOG_LIKELIHOOD_RATIO_NATS
+        or low_pass.gain_nats < MIN_LOW_PASS_LOG_LIKELIHOOD_RATIO_NATS
         or low_pass.lag_s < MIN_FILTER_LAG_S
     ):
         return None
@@ -168,7 +168,7 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     # it fits better than time-correlated noise
     if (
         isinstance(correlated_noise, TimeCorrelatedNoise)
-        and correlated_noise.low_pass_likelihood_gain_nats < MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS
+        and correlated_noise.low_pass_gain_nats < MIN_LOW_PASS_TO_CORRELATED_NOISE_NATS
     ):
         return None
     # At a high position rate, the lag estimated from the correlation of the noise is inaccurate:
