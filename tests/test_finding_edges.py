@@ -1149,3 +1149,26 @@ def test_timestamps_in_bursts_are_reported_as_jitter(size: int, is_reported: boo
 def test_positions_that_odometry_sends_twice_are_reported() -> None:
     one = repeating(50, 100, orientation=object())
     assert named(source_errors.detect_noise_faults, one) == {"source_samples_repeated": "error"}
+
+
+@pytest.mark.parametrize(
+    ("detect", "data", "keys"),
+    [
+        (
+            source_errors.detect_time_correlated_noise,
+            analysis(time_correlated_noise=slow(99.0, 0.0)),
+            {"tau_s", "low_s", "slow_m", "white_m", "gain_nats", "low_pass_gain_nats"},
+        ),
+        (
+            source_positions.detect_low_pass,
+            low_pass(99.0, 1.0),
+            {"correlation", "lag_s", "gain_nats", "sigma_z_m"},
+        ),
+    ],
+)
+def test_evidence_of_fitted_noise_has_the_keys_of_results(
+    detect: Any, data: Any, keys: set[str]
+) -> None:
+    """The fields of the fitted noise are keys of the results."""
+    (found,) = detect(data)
+    assert set(found.evidence) == keys

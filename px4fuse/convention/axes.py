@@ -214,7 +214,7 @@ class Hypothesis:
 
     @property
     def quarter_turns(self) -> int:
-        """Heading of the source's first horizontal axis, in units of 90° (0: north)."""
+        """Heading of the source's first horizontal axis, rounded to units of 90° (0: north)."""
         return round(float(self.parameters[HEADING]) / (np.pi / 2.0))
 
     @property

@@ -124,8 +124,7 @@ def find_convention_faults(
     # - The heading of the gyroscopes drifts. For a source that EKF2 did not fuse, it shows wrong
     #   axes, but not a rotation
     has_no_heading_reference = uses_gyro_heading and not is_fused and not has_wrong_axes
-    # The positions are not rotated if the orientation has a wrong heading (it is then the fault),
-    # if no independent heading is known, or in an FRD frame, which has no fixed rotation from north
+    # - An FRD frame has no fixed rotation from north
     if has_wrong_heading or is_heading_from_source or has_no_heading_reference or frame == "FRD":
         rotation_deg = 0.0
     faults = ConventionFaults(

@@ -55,7 +55,6 @@ def estimate_barometer_interval_s(fusion_record: FusionRecord) -> float:
         )
         variance_growth_m2 = prior_variance_m2 - barometer_bias_updates["bias_m2"]
         intervals_s = variance_growth_m2 / POSITION_BIAS_NOISE_M_PER_SQRT_S**2
-        # The first fifth may not yet be in the steady state
         lower_quartile_s, median_s, upper_quartile_s = np.percentile(
             intervals_s[len(intervals_s) // 5 :], [25.0, 50.0, 75.0]
         )
@@ -187,7 +186,6 @@ def _combine_barometer_samples(
     )
     row_index = np.minimum(row_index, len(sample_count) - 1)
     intervals_since_row = (time_s - row_times_s[row_index]) / sample_interval_by_row_s[row_index]
-    # Samples between two rows of the log are numbered from 1 to sample_count
     sample_number = np.rint(intervals_since_row).astype(int)
     is_on_sample_grid = (
         is_regular[row_index]
@@ -251,11 +249,10 @@ def _simulate_missing_innovations(
         Logged low-pass filtered innovations.
     """
     # EKF2 filters each innovation ν with f = (1 - w) f_previous + w ν. Age: number of samples from
-    # a sample to the next row of the log. After k samples (age k - 1 to 0), f = (1 - w)^k
-    # f_previous + Σ w (1 - w)^age ν. All simulated innovations of an interval are shifted by the
-    # same offset, so that f is the logged value
+    # a sample to the next row of the log
     w = interval_s / (interval_s + INNOVATION_LOW_PASS_TIME_CONSTANT_S)
-    # After the k samples of an interval: f = (1 - w)^k f_previous + Σ w (1 - w)^age ν
+    # After the k samples of an interval (age k - 1 to 0):
+    # f = (1 - w)^k f_previous + Σ w (1 - w)^age ν
     sample_weight = w * (1.0 - w) ** np.maximum(age_in_samples, 0.0)
     sample_count = age_in_samples[:, 0] + 1.0
     previous_weight = (1.0 - w[:, 0]) ** sample_count

@@ -65,7 +65,7 @@ class BiasEstimator:
         interval_s : ndarray
             Time since the previous sample; 0 if the bias is not updated.
         represented_sample_count : float or ndarray, shape (filters,)
-            Number of EKF2 samples of which this logged sample is the mean.
+            Number of EKF2 samples that this logged sample represents, as their mean.
         """
         # 1. Prediction: the variance grows by the random walk since the previous sample
         is_bias_wrong = np.abs(self.mean_signed_test_ratio) > MAX_MEAN_TEST_RATIO_OF_VALID_BIAS
@@ -75,8 +75,8 @@ class BiasEstimator:
             POSITION_BIAS_NOISE_M_PER_SQRT_S**2,
         )
         bias_variance = np.minimum(self.variance_m2 + bias_noise_m2_per_s * interval_s, R_m2)
-        # The sensor bias is state minus measurement. It is therefore added to the innovation ν,
-        # which is measurement minus state. The innovation of the bias filter is -ν
+        # 2. Correction. The sensor bias is state minus measurement. It is therefore added to the
+        # innovation ν, which is measurement minus state
         innovation_m = innovation_m + self.bias_m
         R = R_m2 + bias_variance
         # 3. Update of the bias. The bias filter measures state minus measurement: its innovation is

@@ -337,7 +337,7 @@ class _Prediction:
             _limit_bias_variance(P, min_bias_variance, batch.estimates_biases)
 
     def restore_constant_bias(self, x: Array, P: Array) -> None:
-        """Undo the fusions of an event for an accelerometer bias that EKF2 holds constant.
+        """Undo an event for an accelerometer bias that EKF2 holds constant: prediction and fusions.
 
         EKF2 holds the bias while it flags a bad acceleration. x and P are changed in place.
         """
@@ -493,8 +493,8 @@ class _PositionFusion:
                 measurements.append((row, self.measured_values[event, :, column], R))
         x, P = _fuse_states(x, P, measurements)
         # 3. If the variance of a state is already below the logged variance, its fusion has no
-        # effect. Therefore the value is set. In flights with vision (logged heading), the height is
-        # not set, because it may be the fused vision height
+        # effect. Therefore the value is set. With a logged heading, the height is not set, because
+        # it may be the fused vision height
         if is_heading_logged:
             x[:, HEADING] = heading_error_rad
             P = 0.5 * (P + np.swapaxes(P, 1, 2))

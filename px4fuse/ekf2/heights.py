@@ -123,8 +123,8 @@ class BadAccelerationFlag:
         *previous_barometer, previous_gnss = previous_innovations
         *barometer, gnss = innovations
         # EKF2 tests the latest innovations of barometer and GNSS after each fusion. Test them in
-        # this sequence: last samples of the previous event, each barometer sample of this event,
-        # GNSS sample of this event
+        # this sequence:
+        # 1. After the last samples of the previous event
         latest_barometer_innovation = np.full_like(gnss, np.nan)
         for sample in previous_barometer:
             latest_barometer_innovation = np.where(
@@ -177,8 +177,8 @@ class HeightFilter:
     down_m, age_s, time_s : ndarray
         Height (m, down) of each sample, age at its fusion event, and measurement time.
     dead_zone_m, weight, has_sample : ndarray
-        Width of the dead zone for positive innovations (ground effect), number of EKF2 samples of
-        which the logged sample is the mean, and True for a sample (False for padding).
+        Width of the dead zone for positive innovations (ground effect), number of EKF2 samples that
+        the logged sample represents, and True for a sample (False for padding).
     last_sample_s : ndarray, shape (filters,)
         Time (s) of the last sample of the sensor whose bias EKF2 estimates.
     update_records : ndarray, shape (events, k + 2, 4, filters)

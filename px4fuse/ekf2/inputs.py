@@ -474,7 +474,7 @@ def read_gnss(
     if fuses_velocity and velocity_samples[Columns.VELOCITY].notna().all(axis=None):
         velocity = velocity_samples[Columns.VELOCITY].to_numpy()
         velocity_variance = velocity_samples[Columns.VELOCITY_VARIANCE].fillna(0.0).to_numpy()
-    # GNSS is assumed to arrive without delay
+    # Fixes are assumed to arrive at their timestamps
     rejected_flags, is_reset_to_sample = _read_logged_decisions(
         ekf2, fusion_record, timestamp_s, timestamp_s, GNSS_POS
     )
@@ -614,7 +614,7 @@ def _read_logged_decisions(
     for begin, end in (*fusion_to_log_rows, *dead_reckoning_rows):
         rejected_flags[begin : max(end - 1, 0)] = 1.0
     may_be_reset_sample = np.isnan(rejected_flags)
-    # The log contains EKF2's decision (fused or rejected) on some of the samples
+    # 2. The log contains EKF2's decision (fused or rejected) on some of the samples
     innovation_rows = find_matching_samples(innovations.index.to_numpy(), measurement_times_s)
     is_logged = innovation_rows >= 0
     innovations_of_samples = innovations.iloc[innovation_rows[is_logged]]
@@ -638,7 +638,7 @@ def _read_logged_decisions(
             is_reset[rows_after_dead_reckoning[0]] = True
         elif len(reset_rows):
             is_reset[reset_rows[-1]] = True
-    # 4. The samples of the last fusions, just before the first span, are not rejected
+    # 4. The samples of the last fusions, each just before a span to a log row, are not rejected
     rows_after_fusion = fusion_to_log_rows[:, 0]
     fused_rows = rows_after_fusion[rows_after_fusion > 0] - 1
     is_undecided = ~is_reset[fused_rows] & np.isnan(rejected_flags[fused_rows])

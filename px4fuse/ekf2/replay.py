@@ -542,6 +542,7 @@ def _judge_agreement(
     3. If not, and few samples are rejected, the replay does not agree. With many rejections,
        rejected fraction and mean NIS must agree: a different rejection changes later innovations.
     """
+    # 1. Innovation variances
     variance_ratios = (axis.s_ratio_median for axis in axes.values())
     worst_variance_ratio = max(variance_ratios, key=lambda s_ratio: abs(s_ratio - 1.0))
     if abs(worst_variance_ratio - 1.0) > MAX_INNOVATION_VARIANCE_RATIO_DEVIATION:

@@ -277,7 +277,6 @@ def group_samples_by_event(
     """
     # 1. Event of each sample. Samples after the last event are not used
     event_indices = np.searchsorted(event_steps, measurement_step_indices)
-    # Samples that are measured after the last event are not fused
     sample_count = int(np.searchsorted(event_indices, len(event_steps)))
     event_indices = event_indices[:sample_count]
     measurement_steps = measurement_step_indices[:sample_count]

@@ -354,8 +354,8 @@ def make_stepwise_configurations(
         disable_time_s_by_aid=dict.fromkeys((MAG.name, *additional_aids), 0.0),
         timestamp_offset_s=kf_settings.clock_offset_s - applied_delay_s,
     )
-    # For each property, the fields of FilterConfiguration that change from KF to EKF2, in the order
-    # of the replays
+    # 2. For each property, the fields of FilterConfiguration that change from KF to EKF2, in the
+    # order of the replays
     replacements: dict[str, dict[str, Any]] = {
         TIMESTAMPS_PROPERTY_NAME: {
             "settings": {**logged_settings, **kf_noises},

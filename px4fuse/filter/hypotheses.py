@@ -247,14 +247,13 @@ def _fit_scale(design_matrix: DesignMatrix, is_skipped: BoolArray) -> Estimate:
     tested_scales = TESTED_SCALE_FACTORS.tolist()
     fit_scale = cache(lambda index: design_matrix.fit(is_skipped, tested_scales[index]))
 
-    # Minimum of the parabola through the lowest score and its neighbours
-
     def compute_score(index: int) -> float:
         # The term ln S of the likelihood is omitted, because it would bias the scale factor to zero
         return fit_scale(index).residual_and_prior_square_sum / 2.0
 
     centre_index = _find_minimum(compute_score, len(tested_scales))
     centre_index = min(max(centre_index, 1), len(tested_scales) - 2)
+    # Minimum of the parabola through the lowest score and its neighbours
     nearby_scores = np.array([compute_score(centre_index + shift) for shift in (-1, 0, 1)])
     vertex_shift, curvature = fit_parabola_vertex(nearby_scores, 1)
     if curvature <= 0.0:
@@ -432,8 +431,8 @@ def _locate_jump(
         fit, _ = design_matrix.fit_with_jump(jump_time_s, is_skipped | is_near_jump)
         return fit.compute_residual_squares() > max_residual_square
 
-    # First test the measurements after the jump: in the fit without the jump, correct measurements
-    # seemed to be outliers. Then test the measurements near the jump, for each possible jump time
+    # 1. Test the measurements after the jump again: in the fit without the jump, correct
+    # measurements seemed to be outliers
     is_skipped = np.where(is_after_jump, test_for_outliers(jump.time_s), is_skipped)
     # 2. Choose the times near the jump with the largest χ², with all measurements near it
     candidate_times_s = time_s[is_near_jump]

@@ -141,7 +141,7 @@ class PositionsAndIncrements:
             measurement_and_prior_precision[
                 self.segment_start_indices[has_too_few_measurements]
             ] += 1.0
-            # Degrees of freedom: number of measured states and of initial states with a strong
+            # 2. Degrees of freedom: number of measured states and of initial states with a strong
             # prior, minus two for each segment, which determine its initial position and velocity
             is_known = (measurement_and_prior_precision > 0.0) & (
                 (measurement_and_prior_precision > self.prior_precision)

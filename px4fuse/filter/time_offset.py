@@ -356,7 +356,6 @@ def _simulate_variance_increase_by_imu_noise(
     is_within_segment = positions_at_offset.is_within_segment
     measurement_count = len(imu_motion.time_s)
     axis_count = len(imu_motion.axis_directions)
-
     rng = np.random.default_rng(measurement_count)
     first_segment_of_each_group = np.arange(
         0, len(imu_motion.segment_motions), SEGMENTS_PER_NOISE_SIMULATION
@@ -385,7 +384,6 @@ def _simulate_variance_increase_by_imu_noise(
     velocity_noise = np.zeros_like(error_m)
     for begin, end in pairwise(imu_motion.segment_edges.tolist()):
         np.cumsum(dv[..., begin : end - 1], axis=-1, out=velocity_noise[..., begin + 1 : end])
-
     # 2. Inner product of residuals (error_m, dp, dv) and velocity noise, for each segment and
     # series. Its variance over the series, summed over groups of segments, is the additional
     # variance of the score

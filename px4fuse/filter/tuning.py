@@ -365,7 +365,8 @@ def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z_m: float) -> NoiseEstimate:
 
     # find_profile_likelihood_interval needs a second parameter. It has no effect here
     def score(log_sigma_a: float, _: float = 0.0) -> float:
-        sigma_a_m_s2 = float(np.clip(np.exp(log_sigma_a), *SIGMA_A_SEARCH_RANGE_M_S2))
+        # Limit the logarithm: the search may try values whose exponential overflows
+        sigma_a_m_s2 = float(np.exp(np.clip(log_sigma_a, *np.log(SIGMA_A_SEARCH_RANGE_M_S2))))
         return fit.score(NoiseParameters(sigma_a_m_s2, sigma_z_m))
 
     start = float(np.log(fit.noise_parameters.sigma_a_m_s2))

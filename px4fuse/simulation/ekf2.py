@@ -370,7 +370,7 @@ def _compute_output(inputs: ReplayInputs, model_run: SegmentRun) -> Ekf2Output:
     # The height is never reset
     reset_m = np.zeros((len(state), 3))
     reset_m[reset_steps, :2] = reset_sizes_m
-    # Attitude error (NED) of the output predictor. 1. It integrates the newest gyro samples, from
+    # Attitude error (NED) of the output predictor. It integrates the newest gyro samples, from
     # which it subtracts the older gyro bias of the fusion horizon
     gyro_bias_rad_s = rotate(segment.body_to_ned[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:])
     attitude_error_increments_rad = (
