@@ -51,11 +51,11 @@ MIN_CONCORDANCE_CORRELATION_WITHOUT_WARNING = {EKF2_REFERENCE: 0.9, IMU_REFERENC
 MAX_TIME_OFFSET_SIGMA_S = 0.5
 # The best frame is unambiguous if the residual in the second best frame is larger by this factor
 MIN_SECOND_TO_BEST_FRAME_RESIDUAL_RATIO = 1.3
-# Test of a yaw from the user: minimum ratio of the horizontal RMS residual (file to reference
-# track) with this yaw to the residual with the estimated yaw, to report that the yaw is wrong
+# A yaw from the user is reported as wrong only if the horizontal RMS residual (file minus reference
+# track) with this yaw exceeds this multiple of the residual with the estimated yaw
 MIN_RESIDUAL_RATIO_OF_GIVEN_TO_ESTIMATED_YAW = 2.0
-# Test of a yaw from the user: minimum horizontal RMS residual (m) from file to EKF2's position with
-# this yaw, to report that the yaw is wrong
+# A yaw from the user is reported as wrong only if the horizontal RMS residual (file minus EKF2's
+# position) with this yaw exceeds this value (m)
 MIN_RESIDUAL_OF_MISALIGNED_FRAME_M = 0.3
 
 
@@ -296,8 +296,8 @@ def _refit_without_origin_resets(
         ekf2_track,
         is_lag_estimated=problem.lag_s is None,
     )
-    # Both fits of the match are repeated, each from its own lag. Without a yaw from the user, they
-    # are the same fit
+    # Repeat the fit with estimated yaw and the fit with the user's yaw. Each starts at the lag that
+    # it had before. If the user gave no yaw, both are the same fit
     fit_with_estimated_yaw = refit(match.fit_with_estimated_yaw, yaw_rad=None)
     fit = fit_with_estimated_yaw
     if problem.yaw_rad is not None:

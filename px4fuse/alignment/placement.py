@@ -305,7 +305,8 @@ def _apply_alignment(
         yaw_sigma_deg = float(np.degrees(match.fit.yaw_sigma_rad or 0.0))
         if reference_name == EKF2_REFERENCE:  # the IMU cannot determine the frame's origin
             origin_m = match.fit.origin_m
-    # clock_offset_s = boot clock minus clock of the file; lag_s = flight time of its first position
+    # lag_s is the time of the file's first position, in seconds from the start of the log.
+    # clock_offset_s is the boot clock minus the clock of the file
     time_offset_reason = "the offset was given with --clock-offset"
     if match and clock_offset_s is None:
         lag_s = match.time_offset_fit.lag_s
@@ -321,8 +322,9 @@ def _apply_alignment(
         )
     aligned_samples = align_samples(problem.samples, frame, yaw_rad, origin_m, lag_s)
     distance_to_ekf2_m = None
-    # Compare the file with EKF2 also without a match, if the user gave all parameters. EKF2 did not
-    # match a file that was matched with the IMU
+    # Compare the positions of the file with EKF2's position, also if the user gave all parameters
+    # and no match was necessary. The match with the IMU is used only if the match with EKF2 failed,
+    # so this comparison is then omitted
     if reference_name != IMU_REFERENCE and (
         ekf2_comparison := _compare_with_ekf2(flight, aligned_samples)
     ):
@@ -334,7 +336,8 @@ def _apply_alignment(
         warnings += _find_match_warnings(match, is_yaw_estimated)
         if not is_yaw_estimated:
             frame_conflicts += _find_frame_conflict(match, distance_to_ekf2_m, yaw_rad)
-    # A wrong frame makes the correlation low, and its message is more precise
+    # A wrong frame also makes the correlation low. Its warning (in frame_conflicts) is more
+    # precise, so it replaces the warning about the correlation
     if (
         distance_to_ekf2_m is not None
         and not (is_yaw_estimated or frame_conflicts)
@@ -408,11 +411,12 @@ def _find_frame_conflict(
     reference_name, fit = match.reference.name, match.fit_with_estimated_yaw
     yaw_deg = np.degrees(np.angle(np.exp(1j * (fit.yaw_rad - yaw_rad))))
     if distance_to_ekf2_m is None:
-        # No comparison with EKF2: the fits allow any origin, so they show the rotation only
+        # Without a comparison with EKF2, only a rotation can be detected: the origin of the file's
+        # frame is estimated in each fit, so a shift does not increase the residuals
         has_conflict, shift_text = match.is_given_yaw_wrong, ""
     else:
-        # The distances contain rotation and shift. Residual per horizontal axis, like
-        # TrackFit.horizontal_residual_rms_m
+        # A rotation and a shift of the file's frame both increase its distance to EKF2. Division by
+        # √2 converts the RMS distance to the RMS residual per horizontal axis
         residual_m = compute_clipped_rms_m(distance_to_ekf2_m) / np.sqrt(2.0)
         shift_m = np.hypot(*fit.origin_m[:2])
         has_conflict = (

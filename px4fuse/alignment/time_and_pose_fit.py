@@ -120,8 +120,9 @@ def find_correlation_peak(
     # If the vehicle is at rest in both tracks, the sum of squared positions (relative to their
     # mean) is only a rounding error
     has_overlap &= square_sum_m2 > 1e-9 * np.max(square_sum_m2)
-    # A rotation of the file by yaw multiplies the covariance by e^{-i·yaw}. The best yaw makes it
-    # real and positive
+    # Horizontal positions are complex numbers (north + i·east). A rotation of the file by yaw
+    # therefore multiplies its covariance with the reference by e^{-i·yaw}. The estimated yaw makes
+    # this product real and positive, which is its largest real part
     rotated_covariance = (
         np.abs(covariance) if yaw_rad is None else (np.exp(-1j * yaw_rad) * covariance).real
     )
@@ -217,8 +218,9 @@ def fit_by_least_squares(
     )
     sigma_product_m2 = np.sqrt(file_position_variance_m2 * reference_position_variance_m2)
     covariance_m2 = np.vdot(file_position_m, reference_position_m) / len(file_position_m)
-    # The coherence is the correlation as a complex number: its phase is the yaw, and its magnitude
-    # does not depend on scale. The concordance (below) also decreases with a difference in scale
+    # The complex correlation coefficient (coherence) of file and reference has the yaw as its
+    # phase. Its magnitude does not depend on a scale factor between them. The concordance
+    # correlation coefficient (below) decreases with such a factor
     coherence = complex(covariance_m2 / sigma_product_m2) if sigma_product_m2 > 0.0 else 0j
     reference_horizontal_position_m = reference.to_complex_m()
 
@@ -257,7 +259,6 @@ def fit_by_least_squares(
     parameters[is_fitted] = solution.x
     parameter_sigma = np.full(4, np.nan)
     parameter_sigma[is_fitted] = _compute_parameter_sigma(np.asarray(solution.jac), residuals_m)
-    # Results: parameters with σ, concordance, origin of the file, and residuals
     origin_north_m, origin_east_m, lag_correction_s, fitted_yaw_rad = parameters.tolist()
     _, _, lag_sigma_s, yaw_sigma_rad = parameter_sigma.tolist()
     # At its limit, the lag is not determined by the data

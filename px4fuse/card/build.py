@@ -76,7 +76,9 @@ SMALL_INNOVATIONS_EXPLANATION = (
     "The innovations are smaller than expected. Small innovations are not a fault here: the "
     "source may drift, and innovations do not show drift. Do not reduce noise settings."
 )
-# Ratio actual ÷ reported σ: maximum against ground truth ÷ against the source, if both agree
+# The σ ratio (actual σ ÷ reported σ) against ground truth is compared with the σ ratio against the
+# source. They agree if the verdicts are the same and the first is at most this multiple of the
+# second
 MAX_TRUTH_TO_SOURCE_RATIO = 2.0
 PRINTED_FIRST_BYTES = 4  # number of first bytes of an unreadable log that are printed
 ULOG_FIRST_BYTES = "55 4C 6F 67"  # first bytes of each ULog file (hexadecimal)
@@ -144,7 +146,8 @@ def build_card(
         make_cause(analysis, ranked_cause, verdicts, request)
         for ranked_cause in ranked_causes[:MAX_CAUSES_ON_CARD]
     )
-    # mark the verdicts on the reported σ that need no change of settings as explained
+    # An inconsistent σ is not always a fault of the filter settings. Find the verdicts that need no
+    # change of settings, and the reason
     sigma_verdicts, explanation = _explain_verdict_differences(analysis, verdicts, causes)
     effect = _summarise_errors(analysis)
     severity: CardSeverity = "clean"
@@ -356,8 +359,9 @@ def _describe_worst_axis(analysis: Analysis) -> list[str]:
     """
 
     def compute_error_to_sigma_ratio(result: AxisComparison) -> float:
-        # An axis with ratio 0 is not described: EKF2's errors against ground truth are unknown or,
-        # along another axis than the main axis, are only due to the lag of EKF2's output
+        # Return 0 to omit the axis if EKF2's errors against ground truth are unknown. Omit a
+        # secondary axis also if EKF2 is overconfident only because of the lag of its output
+        # predictor
         truth = result.filters["ekf2"].truth
         if isinstance(truth, Unavailable) or (
             truth.has_only_lag_errors and result is not analysis.main
@@ -476,9 +480,10 @@ def _explain_verdict_differences(
     """
     may_drift, ekf2_errors = analysis.source.origin.may_drift, analysis.main.filters["ekf2"].truth
     sigma_verdicts = _mark_explained_verdicts(sigma_verdicts, causes, may_drift=may_drift)
-    # make_sigma_verdicts returns the verdict on EKF2 against ground truth last
+    # The last verdict is that on EKF2 against ground truth
     *other_verdicts, ekf2_verdict = sigma_verdicts
-    # Without another cause, EKF2 is consistent if the error of its delayed position fits σ
+    # EKF2 reports σ for its position at the fusion horizon, not for the published position. If no
+    # fault is known and the error at the fusion horizon agrees with σ, EKF2 is consistent
     if (
         not causes
         and ekf2_verdict.word == "overconfident"
@@ -493,8 +498,8 @@ def _explain_verdict_differences(
                 "consistent. The output predictor adds a lag error to the published position."
             )
     explanation = _explain_differing_verdicts(analysis, sigma_verdicts, causes)
-    # If verdicts of innovations and of ground truth contradict each other without a known reason,
-    # none of them is explained
+    # The innovations and the errors against ground truth may give contradictory verdicts without a
+    # known reason. Then do not mark any verdict as free of fault
     if explanation == UNEXPLAINED_DIFFERENCE_TEXT:
         sigma_verdicts = tuple(replace(verdict, is_explained=False) for verdict in sigma_verdicts)
     elif not explanation and may_drift and any(verdict.is_explained for verdict in sigma_verdicts):
@@ -505,7 +510,8 @@ def _explain_verdict_differences(
 def _explain_differing_verdicts(
     analysis: Analysis, sigma_verdicts: Sequence[Verdict], causes: Sequence[DiagnosedCause]
 ) -> str:
-    # Filters that a re-run without the first fault (of KF, or a replay of EKF2) improves
+    # Find the filters whose position and σ both improve in a re-run without the first fault. A
+    # re-run of EKF2 is a replay (is_prediction)
     filters_affected_by_fault = {
         "ekf2" if rerun.is_prediction else "kf"
         for rerun in (causes[0].reruns if causes else ())
@@ -517,7 +523,8 @@ def _explain_differing_verdicts(
         source, truth = (verdict for verdict in sigma_verdicts if verdict.filter == filter_name)
         if source.ratio is None or truth.ratio is None:
             continue
-        # The first fault explains a larger ratio against ground truth with the same verdict
+        # The two σ ratios of a filter may differ strongly although their verdicts are the same. The
+        # first fault is a sufficient reason if a re-run without it improves the filter
         is_truth_ratio_unexplained = (
             truth.ratio > MAX_TRUTH_TO_SOURCE_RATIO * source.ratio
             and filter_name not in filters_affected_by_fault

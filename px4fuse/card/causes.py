@@ -110,8 +110,9 @@ def rank_causes(analysis: Analysis, cause_findings: Sequence[Finding]) -> list[R
         causes or repeated_verdicts,
         key=lambda cause: (
             cause.rank,
-            # faults of the source first: a changed setting may only hide them. This order does not
-            # apply to warnings without a helpful re-run (rank 4)
+            # List faults of the source before wrong settings, because a changed setting may only
+            # hide a fault of the source. Rank 4 (warnings that no re-run confirms) has no such
+            # order
             cause.rank < 4 and _is_wrong_setting(cause.finding),
             -cause.ln_sigma_ratio_reduction,
         ),
@@ -134,8 +135,8 @@ def _find_cause_rank(finding: Finding, reruns: Sequence[Rerun]) -> int:
         or WRONG_CONVENTION_KEY in finding.evidence
     ):
         return 0
-    # A changed setting that leaves a filter overconfident is not the main cause, although its
-    # re-run may make another ratio consistent
+    # If a filter is still overconfident against ground truth after a setting is corrected, this
+    # setting is not the main cause. This applies even if the mean NIS is then consistent
     if _is_wrong_setting(finding) and any(map(remains_overconfident, reruns)):
         return 3
     if any(map(becomes_consistent, reruns)):
@@ -270,11 +271,13 @@ def _make_setting_actions(
         if rerun.kinds == ("delay",):  # _make_actions makes this action
             continue
         if rerun.filter == "ekf2":
-            # Without corrections of the data: the action for the sender states them
+            # Keep only changes of EKF2 parameters. If the re-run also corrected the data, the
+            # action for the sender states this correction
             change = {name: value for name, value in change.items() if name in MODEL_PARAMETERS}
             if change:
                 yield make_parameter_action(analysis, change)
-        # The closing sentence of the cause names the default settings
+        # A re-run of KF with default settings gives no command here: the last sentence of the cause
+        # states that KF is consistent with default settings
         elif rerun.kinds != ("defaults",) and change.keys() <= COMPARISON_OPTIONS.keys():
             # --clock-offset replaces the offset from the alignment, so it must include that offset
             if TIME_OFFSET_KEY in change and (alignment := analysis.source.alignment):
@@ -313,16 +316,17 @@ def _make_sender_actions(
     - Other faults: the action of the finding, if it has one.
     """
     finding, source, model = ranked_cause.finding, analysis.source, analysis.ekf2_model
-    # A re-run with corrected timestamps helps: the sender must shift them. A GNSS receiver cannot
-    # shift its timestamps: it needs the remedy of the finding
+    # If a re-run with shifted timestamps improves a filter, the sender must shift its timestamps. A
+    # GNSS receiver cannot do this, so the action of the finding is used for it
     if offset_rerun and not (source.origin.is_gnss and finding.remedy):
         shift_s = offset_rerun.change[TIME_OFFSET_KEY]
-        # a re-run of KF tests the total time offset. The sender corrects only the difference from
-        # the clock offset of this analysis (--clock-offset)
+        # In a re-run of KF, the shift includes the clock offset that this analysis already applies
+        # (--clock-offset). The sender must add only the rest
         if offset_rerun.filter == "kf":
             shift_s -= analysis.settings.clock_offset_s
         return [Action("sender", lowercase_first_letter(format_sender_action(source, shift_s)))]
-    # No re-run tested the delay of GNSS (KF uses vision): set the delay that the finding states
+    # If KF uses vision, no re-run tests the delay of GNSS. Then set the delay parameter to the
+    # estimate in the finding
     if (
         finding.id == "ekf2_gps_delay_wrong"
         and not ranked_cause.reruns
@@ -371,9 +375,11 @@ def _find_action_target(finding: Finding, source: PositionTrack | None = None) -
     """Return the device or filter to which the remedy of a finding applies."""
     group = FINDING_CATALOGUE[finding.id].group
     target = ACTION_TARGET_BY_FINDING_ID.get(finding.id) or ACTION_TARGET_BY_GROUP[group]
-    # Findings on the source have a remedy for EKF2 if EKF2, not the source, is set wrongly
+    # The group of a finding on the source has the sender as its target. But if the remedy changes
+    # an EKF2 parameter, the action applies to EKF2
     is_remedy_about_ekf2_parameter = finding.remedy.startswith(("Set EKF2_", "Check EKF2_"))
-    # The same finding covers errors of KF and EKF2: its evidence names the filters
+    # Errors above the reported σ are one finding for both filters. If its evidence contains no σ of
+    # KF, only EKF2 is overconfident
     is_only_ekf2_overconfident = (
         finding.id == "error_exceeds_reported_sigma"
         and finding.evidence.get("filter") == "ekf2"

@@ -100,7 +100,8 @@ def find_candidate_changes(
     if ekf2_inputs is not None:
         delay_change = make_estimated_delay_change(comparison, ekf2_inputs, estimates.time_offset)
     changes += [delay_change] if delay_change else _find_offset_changes(estimates, ekf2_inputs)
-    # 3. Horizontal axes only: rotation, then accelerometer bias (KF) or default parameters (EKF2)
+    # 3. The other changes (rotation of the positions, accelerometer bias, default parameters,
+    # accelerometer noise) are tested along horizontal axes only
     if axis == "down":
         return changes
     if (

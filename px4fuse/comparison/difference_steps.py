@@ -238,8 +238,8 @@ def _describe_property_differences(
         inputs.aid,
         inputs.received_positions.source,
     )
-    # The first replacement changes all inputs of KF: accelerations, positions and sample times.
-    # State the largest of these differences
+    # The first step from KF to EKF2 replaces three inputs of KF by those of EKF2: accelerations,
+    # positions and sample times. Describe only the largest of these differences
     if kf_settings.input == "zero":
         sample_time_text = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
     elif source.name != ekf2_position_source:
@@ -249,7 +249,8 @@ def _describe_property_differences(
             f"KF predicts every {kf_settings.dt_s:g} s, starting at its first position; EKF2 "
             f"predicts every {1e3 * inputs.mean_step_s:.0f} ms"
         )
-    # Age of a position at its timestamp: a position with a late timestamp has a negative offset
+    # KF assumes that a position is this old at its timestamp. The correction --clock-offset is
+    # negative for late timestamps, that is, for old positions
     position_age_ms = 1e3 * (source.assumed_delay_s - kf_settings.clock_offset_s)
     delay_text = (
         f"EKF2 assumes that positions are {parameters[aid.delay]:g} ms old ({aid.delay}), KF "

@@ -83,8 +83,9 @@ MIN_PERIOD_COUNT = 5.0
 MAX_FREQUENCY_HZ = 2.0
 FREQUENCY_STEP_IN_PERIODS_PER_FLIGHT = 0.2
 MIN_BINS_PER_PERIOD = 30
-# Maximum fraction of the mean square of the vehicle's motion at the frequency of the sinusoidal
-# error: with more motion at this frequency, the motion may cause the error
+# A sinusoidal position error is reported only if at most this fraction of the vehicle's mean square
+# motion is at the frequency of the error. With more motion at this frequency, the motion may cause
+# the error
 MAX_FRACTION_OF_MOTION_AT_ERROR_FREQUENCY = 0.1
 # Delay of the logged attitude: vehicle rotations from the attitude are compared with rotations
 # integrated from the gyroscopes. Interval (s) between the starts of successive rotations
@@ -223,7 +224,8 @@ def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
         return None
     interval_s = compute_median_interval_s(time_s)
     rows, weights = _compute_interpolation_weights(time_s, interval_s)
-    # σ of the residual (value - Σ weight · neighbour) ÷ σ of a value, for equal σ of all values
+    # If all values have the same σ, the residual (value - Σ weight · neighbour) has this multiple
+    # of σ. Positions with a large multiple are omitted, because their interpolation amplifies noise
     sigma_ratio = np.sqrt(1.0 + np.sum(weights**2, axis=1))
     is_accurate = sigma_ratio < MAX_RESIDUAL_TO_POSITION_SIGMA_RATIO
     rows, weights, sigma_ratio = rows[is_accurate], weights[is_accurate], sigma_ratio[is_accurate]
@@ -271,7 +273,8 @@ def _compute_interpolation_weights(time_s: Array, interval_s: float) -> tuple[Ar
     neighbour_rows = rows[:, None] + NEIGHBOUR_ROW_OFFSETS
     elapsed_intervals = (time_s[neighbour_rows] - time_s[rows, None]) / interval_s
     is_without_gap = np.ptp(elapsed_intervals, axis=1) < MAX_NEIGHBOUR_SPAN_IN_MEDIAN_INTERVALS
-    # powers[row, k, neighbour] = tᵏ, so powers @ w = (1, 0, 0, 0): w is column 0 of the inverse
+    # The conditions on the weights w are the linear equations powers @ w = (1, 0, 0, 0), with
+    # powers[row, k, neighbour] = tᵏ. Their solution is column 0 of the inverse matrix
     powers = elapsed_intervals[is_without_gap, None] ** np.arange(4)[:, None]
     return rows[is_without_gap], np.linalg.inv(powers)[:, :, 0]
 
@@ -395,8 +398,9 @@ def fit_errors_against_truth(
     scale_error_sigma = np.sqrt(
         np.mean(residual_m**2) / (path_mean_square_m2 * independent_error_count)
     )
-    # The drift of odometry is no fault: fit errors and columns without their running mean, and use
-    # these residuals. Without running mean, the columns of the constant offsets are zero: omit them
+    # The drift of odometry is no fault. Subtract running means from the errors and from the
+    # columns, so that drift hardly affects the residuals. This makes the columns of the constant
+    # offsets zero, so omit them
     if comparison.source.origin.may_drift:
         from scipy.ndimage import uniform_filter1d  # noqa: PLC0415 - slow import
 
@@ -514,8 +518,9 @@ def find_time_offset_variation(fit: ErrorFit) -> TimeOffsetVariation | None:
         error_per_time_offset_m_s[:, :, None] * time_offsets_by_column_s[flight_part_indices, None]
     )
     parameters, residual_m = _fit_least_squares(columns[..., :-1], columns[..., -1])
-    # Time offsets of (errors - columns · p), that is, of what the constant parameters do not
-    # explain
+    # Fit one time offset per flight part to the errors that the constant parameters p do not
+    # explain: errors - columns · p. The fit is linear, so the offsets fitted to each column are
+    # combined
     offsets_s = (time_offsets_by_column_s @ np.append(-parameters, 1.0))[moving_part_indices]
     white_noise_mean_square_m2 = 2.0 * fit.white_noise_sigma_m**2  # of two axes
     slow_error_m2 = fit.compute_slow_error_mean_square_m2()
@@ -556,9 +561,9 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
     )
     angle_rad = integrate_cumulatively(imu[Columns.ANGULAR_RATE].to_numpy(), imu_time_s)
 
-    # Each tested delay of the attitude is a multiple of ROTATION_INTERVAL_S. The gyroscope
-    # rotations start MAX_ATTITUDE_DELAY_S before the attitude rotations. Without a delay, row i of
-    # the attitude therefore corresponds to row i + max_delay_in_rows of the gyroscopes
+    # Rotations from the gyroscopes start MAX_ATTITUDE_DELAY_S before those from the attitude and
+    # end later, so that each tested delay only shifts the compared rows. Without a delay, row i of
+    # the attitude corresponds to row i + max_delay_in_rows of the gyroscopes
     max_delay_in_rows = round(MAX_ATTITUDE_DELAY_S / ROTATION_INTERVAL_S)
     gyro_time_s = time_s[0] + ROTATION_INTERVAL_S * np.arange(
         -max_delay_in_rows, len(time_s) + max_delay_in_rows

@@ -254,7 +254,8 @@ def _fit_source_errors(
     if isinstance(axes_and_tuning, Unavailable):
         return axes_and_tuning, axes_and_tuning, axes_and_tuning
     flight, settings, (axes, axis_tuning) = comparison.flight, comparison.settings, axes_and_tuning
-    # All fits use timestamps with the significant part of the estimated time offset
+    # If the estimated time offset differs significantly from the offset in the timestamps, all fits
+    # correct the timestamps by the difference
     offset_s = 0.0
     if (
         isinstance(time_offset, SourceTimeOffset)
@@ -308,8 +309,9 @@ def _fit_source_errors(
             correlated_noise,
             source_low_pass,
         )
-    # 4. Withdraw a low-pass filter that an oscillation of the IMU imitates. A real filter would
-    # pass the oscillation to the positions if its lag is short: 2π · frequency · lag < 1
+    # 4. An oscillation of the IMU that the positions do not show can look like a low-pass filter of
+    # the positions. A real filter would pass the oscillation if 2π · frequency · lag < 1, so the
+    # estimated filter is then rejected
     if oscillation is not None and (
         2.0 * np.pi * oscillation.frequency_hz * source_low_pass.lag_s < 1.0
     ):

@@ -27,8 +27,8 @@ BAND_LIMIT_RATIO = 1.33
 # Minimum power of a peak of the acceleration error ÷ median power. In flights without an
 # oscillation, this ratio is below 6
 MIN_PEAK_TO_MEDIAN_POWER_RATIO = 8.0
-# At the frequency of the peak, maximum power in the positions ÷ power in the measured acceleration:
-# both contain a real motion
+# Maximum power in the positions ÷ power in the measured acceleration, at the frequency of the peak.
+# A larger ratio means that the vehicle really oscillates, because the positions also show it
 MAX_SOURCE_TO_IMU_POWER_RATIO = 0.25
 MIN_AMPLITUDE_M_S2 = 0.3
 
@@ -81,11 +81,12 @@ def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | Non
         return None
     peak, peak_to_median_ratio = max(ratio_by_peak.items(), key=lambda item: item[1])
     frequency_hz = float(frequencies_hz[peak])
-    # 3. Amplitude of the acceleration. The 3 frequencies together have 1.5 times the power of the
-    # middle one. With both signs of the frequency, imu_power is 3 times the power of the middle one
+    # 3. Compute the amplitude of the acceleration error. imu_power[peak] is the sum over three
+    # frequencies and both signs. For a Hann window, it is 2 · 1.5 = 3 times the power at the middle
+    # frequency
     amplitude_m = 2.0 * np.sqrt(imu_power[peak] / 3.0) / window.sum()
-    # Derivative ÷ difference of a sinusoid of this frequency; its square is the ratio for second
-    # differences
+    # The amplitude of a sinusoid's derivative is this factor times the amplitude of its difference
+    # between samples. The squared factor converts second differences to accelerations
     acceleration_per_difference = np.pi * frequency_hz / np.sin(np.pi * frequency_hz * interval_s)
     oscillation = ImuOscillation(frequency_hz, float(amplitude_m * acceleration_per_difference**2))
     is_oscillating = (

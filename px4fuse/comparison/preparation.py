@@ -180,7 +180,8 @@ def select_source_innovations(flight: Flight, track: PositionTrack) -> Flight:
         if not item.source and item not in missing_vision_innovations
     ]
     streams = dict(flight.streams)
-    # List the topics of the GNSS innovations as a stream with the properties of EKF2's state
+    # In the list of streams, the GNSS innovations are an entry with their own topics. Its other
+    # properties are those of EKF2's state
     if "ekf2_state" in streams and ekf2.aids:
         streams["ekf2_innovations"] = replace(streams["ekf2_state"], topics=ekf2.innovation_topics)
     missing_data = (*other_missing_data, *missing_gnss_innovations)
@@ -323,8 +324,8 @@ def explain_missing_source(flight: Flight) -> Unavailable:
             f"use {track.name}, which EKF2 did not fuse (--position-source {track.name}), "
             f"or {remedy}"
         )
-    # If a source contains only heights, this specific reason replaces the general reason. The
-    # reason that GNSS has no fix is added
+    # If a source contains only heights, state this more precise reason instead. If GNSS has no
+    # position fix, add this reason
     reason = f"no external position in this log (possible sources: {topics})"
     for item in flight.missing:
         if item.reason == HEIGHT_ONLY_REASON:
@@ -385,7 +386,8 @@ def choose_segment(
         chosen_start_s = chosen_start_s if start_s is None else start_s
         chosen_end_s = chosen_end_s if end_s is None else end_s
         reason = f"chosen with {' and '.join(given_options)}"
-        # A time outside the log has no positions: the error below then states the chosen times
+        # If the chosen times are outside the log, do not clip them: the error message below then
+        # states the times that the user chose
         clipped_span_s = max(chosen_start_s, 0.0), min(chosen_end_s, log.duration_s)
         is_inside_log = clipped_span_s[0] < clipped_span_s[1]
         if is_inside_log and clipped_span_s != (chosen_start_s, chosen_end_s):

@@ -25,8 +25,8 @@ from px4fuse.flight.model import (
 # Minimum measurement noise √R (m) that EKF2 uses (ev_pos_control.cpp, EKF2.cpp)
 EKF2_MIN_NOISE_M = 0.01
 MIN_COMPARED_SAMPLES = 3
-# NED columns of each quantity that is projected onto an axis, and exponent of the direction cosines
-# (2 for variances)
+# Each quantity is projected onto an axis from these NED columns, weighted by the direction cosines
+# with this exponent (2 for variances)
 PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
     "position_m": (Columns.POSITION, 1),
     "velocity_m_s": (Columns.VELOCITY, 1),
@@ -74,7 +74,8 @@ def remove_origin_resets(
             continue
         has_only_moved_origin = False
         if quantity == "position":  # a velocity does not depend on the origin
-            # Without resets of the origin, the track is nearer to the measured positions
+            # If the resets only moved the origin of EKF2's frame, EKF2's track is nearer to the
+            # measured positions after their removal
             samples = cut_to_segment(track.samples, segment)[columns].dropna()
             compute_squared_distance_m2 = partial(_compute_squared_distance_m2, samples)
             candidates = _make_states_without_resets(ekf2.state[columns], resets, axes)
@@ -108,10 +109,12 @@ def _make_states_without_resets(
     """
     reset_m = np.array([reset.delta for reset in resets])[:, axes]
     is_after_reset = np.array([published_state.index >= reset.time_s for reset in resets]).T
-    # Without its previous resets, each position refers to the origin of the first interval
+    # Subtract all earlier resets from each position. All positions then refer to the origin of the
+    # first interval
     state_without_resets = published_state - is_after_reset @ reset_m
     yield state_without_resets
-    # The sum of the first resets converts all positions to the origin of a later interval
+    # The sum of the first k resets converts positions relative to the origin of the first interval
+    # to positions relative to the origin of interval k + 1
     for origin_shift_m in np.cumsum(reset_m, axis=0):
         yield state_without_resets + origin_shift_m
 

@@ -187,7 +187,8 @@ def find_logged_delay_ms(comparison: PreparedComparison) -> float | None:
     if source.origin.aid is None or source.alignment is not None:
         return None
     logged_delay_ms = comparison.flight.log.parameters.get(source.origin.aid.delay)
-    # PX4 does not apply the delay to GNSS timestamps of the sender (assumed_delay_s is then 0)
+    # If the GNSS timestamps are from the sender of the positions, PX4 does not apply its delay
+    # parameter. assumed_delay_s is then 0
     if source.origin.is_fused_as_gnss and source.assumed_delay_s == 0.0:
         return 0.0 if logged_delay_ms == 0.0 else None
     return logged_delay_ms

@@ -27,15 +27,15 @@ MIN_REPORTED_NEES = 4.0
 # A re-run with a smaller noise setting makes a filter overconfident if it increases a mean NEES
 # above 1 to this value or more
 MIN_OVERCONFIDENT_NEES_AFTER_CHANGE = 2.0
-# A re-run with a changed setting or corrected data removes a fraction of ln(mean NIS) or ln(mean
-# NEES): 1 - value after ÷ value before. With a fraction of 1, the filter is consistent. The change
-# is a possible cause of a wrong σ if the fraction differs from 1 by at most this value
+# ln(mean NIS) and ln(mean NEES) are 0 for a consistent filter. A changed setting or corrected data
+# is a possible cause of a wrong σ if the re-run reduces |ln(mean)| to at most this fraction of its
+# value before the change
 POSSIBLE_CAUSE_EXPLAINED_FRACTION_TOLERANCE = 0.5
-# A sensor fault is the only cause of a wrong σ if the fraction of ln(mean NIS) or ln(mean NEES)
-# that its correction removes differs from 1 by at most this value
+# A sensor fault is sufficient as the only cause of a wrong σ if its correction reduces |ln(mean
+# NIS)| or |ln(mean NEES)| to at most this fraction of its value before
 ONLY_CAUSE_EXPLAINED_FRACTION_TOLERANCE = 0.25
-# A change is combined with another change if the fraction of ln(mean NIS) or ln(mean NEES) that its
-# re-run removes differs from 1 by less than this value
+# A change is tested together with another change if it reduces |ln(mean NIS)| or |ln(mean NEES)| to
+# less than this fraction of its value before
 COMBINED_CHANGE_EXPLAINED_FRACTION_TOLERANCE = 0.9
 SENSOR_CORRECTION_KEYS = frozenset((OUTLIERS_KEY, TIME_OFFSET_KEY, ROTATION_KEY, FORWARD_BIAS_KEY))
 # Settings and data corrections that have an effect only together with another change

@@ -214,12 +214,14 @@ def _find_changes_to_test(
         )
         for statistic in CONSISTENCY_STATISTICS
     }
-    # Statistics that are wrong
+    # Inconsistency can show in the mean NEES (errors against ground truth) or in the mean NIS
+    # (innovations). Find the statistics that show it
     statistics: list[Statistic] = ["nees"] if find_error_above_sigma(summary) else []
     if is_inconsistent(summary):
         statistics.append("nis")
     if axis_result is comparison.main:
-        # Changes are also tested if no statistic is wrong. Those for the mean NIS are first
+        # Along the main axis, changes are tested even if the filter is consistent. Changes against
+        # a wrong mean NIS are tested first
         changes = [*candidates["nis"], *candidates["nees"]]
         changes += find_additional_changes(comparison, estimates, ekf2_inputs, changes)
     else:
@@ -429,10 +431,12 @@ def _summarise_replay(
     """
     evaluated_spans_s, axis = model.baseline_replay.find_evaluated_spans(), axis_result.axis
     if ROTATION_KEY in change and comparison.source.origin.is_gnss:
-        # The re-run rotates the GNSS positions, and with them EKF2's frame. Rotate the evaluated
-        # axis by the same angle (clockwise: a negative angle in _rotate_direction)
+        # The re-run rotates the GNSS positions, and EKF2's frame with them. Rotate the evaluated
+        # axis by the same angle. The minus sign is necessary because the change is a clockwise
+        # angle
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION_KEY]))
-    # 1. Innovations S, R and P⁺ along the axis, from north and east
+    # 1. Project three variances from north and east onto the axis: the innovation variance S, the
+    # measurement noise R, and the position variance P⁺ after the update
     cosines, updates = axis.direction[:2], rows_inside(ekf2_replay.updates, evaluated_spans_s)
     innovation_variance_m2, observation_variance_m2, posterior_variance_m2 = (
         weighted_sum(

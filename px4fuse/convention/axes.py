@@ -43,9 +43,11 @@ SMALL_ROTATION_RAD = np.radians(8.0)
 
 # Time offsets up to this value (s) are equally probable a priori
 SMALL_TIME_OFFSET_S = 0.3
-# Log prior odds of axes that differ from multiples of 90° to north by more than SMALL_ROTATION_RAD
+# Log prior odds of a source frame whose horizontal axes are rotated by more than SMALL_ROTATION_RAD
+# from the nearest of the directions north, east, south and west
 LARGE_ROTATION_LOG_PRIOR_ODDS = -1.0
-# Log prior odds of axes that differ from multiples of 90° to north by at most SMALL_ROTATION_RAD
+# Log prior odds of a source frame whose horizontal axes have an estimated rotation of at most
+# SMALL_ROTATION_RAD from the nearest of the directions north, east, south and west
 SMALL_ROTATION_LOG_PRIOR_ODDS = -0.5
 # Log prior odds of a time offset above SMALL_TIME_OFFSET_S
 LARGE_TIME_OFFSET_LOG_PRIOR_ODDS = -2.0
@@ -373,8 +375,9 @@ def _compute_log_likelihoods(
         np.transpose(permutations)
     )
     metres_per_unit = np.array([*METRES_PER_UNIT.values()])
-    # Complex numbers: source axes first + i·handedness·second, IMU north + i·east. The correlation
-    # is the mean of conj(source)·IMU; its phase is the rotation with the smallest residuals
+    # Horizontal vectors are complex numbers: first + i · handedness · second axis for the source,
+    # and north + i · east for the IMU. The phase of the correlation, the mean of conj(source) ·
+    # IMU, is the rotation with the smallest residuals
     horizontal_products = products[..., 0] + 1j * products[..., 1]
     correlation = (
         horizontal_products[:, first_horizontal_axis]
@@ -382,8 +385,8 @@ def _compute_log_likelihoods(
     )
     source_mean_squares = np.maximum(source_mean_squares, 1e-12)
 
-    # Mean squares of source minus IMU, for the best rotation: u²·source² + IMU² - 2·u·correlation,
-    # with u metres per unit. The horizontal mean square is per axis
+    # With u metres per unit, the mean square residual after the best rotation is
+    # u² · source² + IMU² - 2 · u · |correlation|. Division by 2 gives the mean of both axes
     horizontal_mean_square_residual_m2 = (
         metres_per_unit**2
         * (
@@ -398,8 +401,9 @@ def _compute_log_likelihoods(
         + imu_squares_m2[..., 2:]
         - 2.0 * metres_per_unit * (vertical_sign * products[:, vertical_axis, 2])[..., None]
     )
-    # Log likelihood ratio of normal residuals: -½ ln σ² of the residuals for each axis, minus
-    # -½ ln σ² of the source axis itself (in metres: 3 axes, so 6 ln u in total)
+    # For normal residuals, the log likelihood ratio is ½ ln(variance of the source axis ÷ variance
+    # of its residuals), summed over 3 axes. Conversion to metres multiplies each source variance by
+    # u², which adds 6 ln u to the logarithms
     log_likelihood_per_residual = 0.5 * (
         np.log(source_mean_squares).sum(axis=1, keepdims=True)
         + 6.0 * np.log(metres_per_unit)
@@ -506,8 +510,9 @@ def _evaluate_hypothesis(
         interpolated_imu_table[..., 0] - interpolated_imu_table[..., 1:] @ accelerometer_bias_m_s2
     )
     residual = source_second_difference_m - imu_second_difference_m
-    # 3. Log likelihoods: horizontal and vertical residuals, then x, y and z of the source without
-    # the IMU, which is the model for positions that do not depend on the motion
+    # 3. Compute the log likelihoods of two models. In the first, the positions follow the motion
+    # measured by the IMU (horizontal and vertical residuals). In the second, they are unrelated to
+    # this motion: x, y and z of the source have their own distributions
     residual_squares = np.stack([np.sum(residual[:, :2] ** 2, axis=1), residual[:, 2] ** 2])
     log_likelihoods, variances = _fit_student_distributions(
         np.concatenate([residual_squares, unconverted_second_differences.T**2]),
@@ -515,8 +520,9 @@ def _evaluate_hypothesis(
         np.array([MIN_HORIZONTAL_RESIDUAL_SIGMA_M, MIN_VERTICAL_RESIDUAL_SIGMA_M, 1e-6, 1e-6, 1e-6])
         ** 2,
     )
-    # Log likelihood ratio of both models. The density of the positions in metres becomes that in
-    # their unit by ln(metres per unit) for each axis. A constant axis (no heights) is omitted
+    # Compute the log likelihood ratio of the two models. The first density is per metre and the
+    # second per unit of the source: ln(metres per unit) for each axis converts the first. Constant
+    # axes, such as missing heights, are omitted
     is_axis_known = unconverted_second_differences.any(axis=0)
     log_likelihood_gain = (
         log_likelihoods[0]
@@ -600,7 +606,8 @@ def _fit_student_distributions(
         denominators = STUDENT_DEGREES_OF_FREEDOM + squared_residuals / variances[:, None]
         weighted_means = np.mean(squared_residuals / denominators, axis=1)
         variances = np.maximum(degrees_of_freedom * weighted_means / dimensions, min_variances)
-    # ln p = -½ (d ln σ² + (ν + d) ln(1 + r² / (ν σ²))) + constant
+    # Mean log density of the Student t distribution of vectors with d dimensions and length r:
+    # -½ (d ln σ² + (ν + d) ln(1 + r² / (ν σ²))). Its constant terms are omitted
     normalised_squares = squared_residuals / variances[:, None] / STUDENT_DEGREES_OF_FREEDOM
     mean_log1p_squares = np.mean(np.log1p(normalised_squares), axis=1)
     return (

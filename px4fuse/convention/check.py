@@ -49,12 +49,12 @@ MIN_CONVENTION_LOG_ODDS = 4.0
 # The convention (axes, unit, delay) is not determinable if its log-likelihood (nats) exceeds that
 # of positions unrelated to the measured motion by less than this value
 MIN_CONVENTION_LOG_LIKELIHOOD_GAIN = 8.0
-# If no other convention (axes, unit, delay) fits nearly as well, the best one is doubtful below
-# this gain in log-likelihood (nats) per independent residual, relative to positions unrelated to
-# the motion
+# A convention (axes, unit, delay) is compared with positions unrelated to the measured motion. It
+# is doubtful if its gain in log-likelihood (nats) per independent residual is below this value
 MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE = 0.15
-# If other conventions (axes, unit, delay) fit nearly as well, the best one is doubtful below this
-# gain in log-likelihood (nats) per independent residual
+# If other conventions (axes, unit, delay) fit nearly as well, the best one is doubtful if its gain
+# in log-likelihood (nats) per independent residual, relative to positions unrelated to the measured
+# motion, is below this value
 MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE_IF_AMBIGUOUS = 0.4
 # A convention (axes, unit, delay) is doubtful if the ratio of displacements in the positions to
 # displacements integrated from the IMU is outside these limits
@@ -359,8 +359,8 @@ def _estimate_clock_drift(
     A large drift hides the motion. If the best hypothesis on the axes fits badly, the search is
     therefore repeated with several drifts.
     """
-    # If no hypothesis fits, test a grid of drifts. It is searched for candidates only, because a
-    # refinement of each would take too long
+    # If no hypothesis fits, a large clock drift may hide the motion: search a grid of drifts. Only
+    # compare the unrefined candidates of each drift, because refining them would take too long
     start_hypothesis, removed_drift = best_hypothesis, 0.0
     if (
         best_hypothesis.score < MIN_CONVENTION_LOG_LIKELIHOOD_GAIN
@@ -384,8 +384,9 @@ def _estimate_clock_drift(
         positions.compute_second_differences(imu_motion),
         imu_motion,
     )
-    # Without a removed drift, the drift must increase the score. The score of a candidate is not
-    # refined, so a removed drift is not tested here, but by determine_source_convention
+    # A small drift must increase the score significantly. After a drift from the grid was removed,
+    # no refined score without drift exists for comparison: determine_source_convention then tests
+    # the drift
     if (
         not removed_drift
         and hypothesis.score <= start_hypothesis.score + MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT
@@ -430,17 +431,17 @@ def _check_orientation(
         imu_motion.time_s < time_s[-1] - SECOND_DIFFERENCE_WINDOW_S
     )
     imu_motion = replace(imu_motion, is_valid=imu_motion.is_valid & is_covered)
-    # Headings (°) of the x axis of the positions in this motion if there is no heading error. With
-    # z down, x is north. With z up, x is north in NWU, and east in ENU: if the frames of the
-    # orientation do not show which, both are possible
+    # These headings (°) of the positions' x axis are expected without a heading error. With z down,
+    # x points north. With z up, x points north (NWU) or east (ENU). Both are possible if the frames
+    # of the orientation are unknown
     if axis_permutation.vertical_sign > 0 or convention.frames == "FLU to NWU":
         expected_x_axis_headings_deg = [0.0]
     elif convention.frames == "FLU to ENU":
         expected_x_axis_headings_deg = [90.0]
     else:
         expected_x_axis_headings_deg = [0.0, 90.0]
-    # Use the most likely rotation with the axes and unit that are already determined. Here, the key
-    # "EKF2" only means that the heading has no drift
+    # Axes and unit are already determined: find the most likely rotation with them. The key "EKF2"
+    # means that the heading of the IMU motion does not drift
     for hypothesis in search_hypotheses(positions, {"EKF2": imu_motion}):
         if (
             hypothesis.has_rotation

@@ -110,10 +110,10 @@ def find_convention_faults(
         return ConventionFaults(orientation=orientation_fault)
     is_fused = is_source_fused(flight)
     has_wrong_axes, rotation_deg = _find_axis_fault_and_rotation(convention)
-    # The rotation is a fault of the positions only if its reference is correct:
-    # - With a wrong heading of the source, the orientation is the fault
+    # In the following cases, a rotation of the positions is not reported as their fault:
+    # - The orientation sent by the source has a wrong heading. The orientation is then the fault
     has_wrong_heading = orientation_fault in ("order", "heading")
-    # - If EKF2 fused the yaw of the source, EKF2's heading is no reference for the positions
+    # - EKF2 fused the yaw of the source, so EKF2's heading is not an independent reference
     uses_gyro_heading = convention.heading_from == "gyroscopes"
     is_heading_from_source = (
         is_fused
@@ -121,8 +121,8 @@ def find_convention_faults(
         and convention.orientation is not None
         and orientation_fault != "copied"
     )
-    # - The heading of the gyroscopes drifts. For a source that EKF2 did not fuse, it shows wrong
-    #   axes, but not a rotation
+    # - EKF2 did not fuse the source, and only the heading from the gyroscopes is available. It
+    #   drifts, so it shows wrong axes (multiples of 90°), but not a rotation
     has_no_heading_reference = uses_gyro_heading and not is_fused and not has_wrong_axes
     # - An FRD frame has no fixed rotation from north
     if has_wrong_heading or is_heading_from_source or has_no_heading_reference or frame == "FRD":
@@ -147,8 +147,8 @@ def _find_axis_fault_and_rotation(convention: Convention) -> tuple[bool, float]:
     The axes are wrong if no rotation about the vertical makes them NED. The rotation is the one
     that remains after a conversion of wrong axes to NED; it is 0 if it is small.
     """
-    # Wrong axes: the sent frame is the nearest one of right angles, so the fault is this frame and
-    # the small rotation that is left
+    # A rotation about the vertical cannot make these axes NED. The fault is the nearest frame with
+    # axes along multiples of 90° from north; only a small rotation remains
     rotation_deg, is_z_up = convention.rotation_deg, convention.z == "up"
     is_enu_or_nwu = convention.axes in (FRAME_AXES["ENU"], FRAME_AXES["NWU"])
     if convention.is_mirrored or is_enu_or_nwu or convention.z not in ("up", "down"):
@@ -200,7 +200,8 @@ def convert_to_px4_convention(
         _correct_times(samples.index, faults),
         Columns.POSITION + Columns.POSITION_VARIANCE,
     )
-    # The kind VIO was inferred from the orientation, which is not a measurement
+    # The kind "vio" was inferred because the source sends an orientation. A copy of EKF2's attitude
+    # is not a measurement, so infer the kind from the positions
     if faults.orientation == "copied" and origin.kind == "vio":
         origin = structs.replace(origin, kind=infer_position_kind(samples))
     if faults.orientation in ("copied", "heading"):

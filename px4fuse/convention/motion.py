@@ -280,7 +280,7 @@ def integrate_imu_motion(inertial_data: InertialData, attitude: Array) -> ImuSec
     displacement_m -= table
     displacement_m *= INTEGRATION_STEP_S**2
     np.cumsum(displacement_m, axis=0, out=position_m[1:])
-    # Keep one second difference per GRID_INTERVAL_S
+    # Reduce the rate: keep one value per GRID_INTERVAL_S of the second differences
     window_steps = round(SECOND_DIFFERENCE_WINDOW_S / INTEGRATION_STEP_S)
     stride = round(GRID_INTERVAL_S / INTEGRATION_STEP_S)
     second_differences = compute_second_differences(position_m, window_steps)[::stride]

@@ -50,12 +50,12 @@ MAX_TILT_DIFFERENCE_DEG = 6.0
 # even with the best convention (quaternion order, frames), the orientation is unrelated to the
 # vehicle's attitude
 MAX_HEADING_DIFFERENCE_DEG = 12.0
-# The score of a convention (quaternion order, frames) measures its agreement with the reference
-# attitude. Lower limit (°) of the median angle differences in the score: smaller differences are
-# noise
+# The score of a convention (quaternion order, frames) is larger for smaller median angles (°)
+# between orientation and reference attitude. Angles below this value count as this value, because
+# smaller ones are noise
 ANGLE_DIFFERENCE_FLOOR_DEG = 0.7
-# The score of a convention (quaternion order, frames) decreases by this factor · duration (s) ·
-# ln(median angle difference to the reference attitude)
+# The score of a convention (quaternion order, frames) contains -weight · duration (s) · (ln(median
+# tilt difference) + ln(median heading difference)), with this weight
 ANGLE_DIFFERENCE_WEIGHT_PER_S = 0.5
 # For the verdict "determined", the score of the best convention (quaternion order, frames) must
 # exceed that of the second best by this value

@@ -39,9 +39,9 @@ def find_axes_in_file(axes: AxisDirections, frame: str) -> AxisDirections:
     frame : str
         Frame from which the positions were converted to NED, for example "ENU".
     """
-    # DIRECTIONS are the directions of x, y, z, -z, -y, -x after a correct conversion, and ``axes``
-    # with their opposites are the true ones. For example, a column that ``frame`` defines as up is
-    # the -z axis after the conversion, so its true direction is the opposite of axes[2]
+    # If ``frame`` is correct, the axes x, y, z, -z, -y, -x of the converted positions point in
+    # DIRECTIONS. They really point in ``axes`` and their opposites. For example, a column that is
+    # up in ``frame`` becomes the -z axis, so its true direction is the opposite of axes[2]
     true_directions = dict(zip(DIRECTIONS, append_opposites(axes), strict=True))
     x, y, z = (true_directions[name] for name in FRAME_AXES[frame])
     return x, y, z

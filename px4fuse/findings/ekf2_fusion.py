@@ -327,9 +327,9 @@ def detect_aid_faults(
         yield _make_not_fused_finding(
             fusion_parameter, aids_of_sensor, kf_position_aid, height_error_m
         )
-    # Other findings report the overconfidence of the aiding source whose positions KF also uses.
-    # Test first if the mean innovation changes in flight, because such a change also affects the
-    # mean NIS and the mean innovation of the whole flight
+    # Test first if the mean innovation changes in flight: such a change also affects the mean
+    # innovation and the mean NIS of the whole flight. If KF uses the positions of an aiding source,
+    # other findings report that EKF2 is overconfident
     for name, aid in aids_to_test.items():
         sensor_cause = _find_shared_sensor_cause(AIDS[name].switch, kf_position_aid)
         if not sensor_cause and any(result.change for result in aid.axes.values()):

@@ -128,7 +128,8 @@ def make_hidden_error_finding(
             f"{analysis.axes[axis].axis.label}, reported σ "
             f"{format_metres(error.reported_sigma_m)} m."
         )
-    # 2. The cause of the worst error or, without it, that of the other filter's error
+    # 2. Find the cause of the largest error. If its cause is unknown, use the cause of the other
+    # filter's error
     cause = (
         rerun_by_filter.get(worst_filter)
         or rerun_by_filter.get("kf")

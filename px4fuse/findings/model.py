@@ -50,8 +50,8 @@ ACCELEROMETER_CAUSE = "accelerometer"
 UNKNOWN_CAUSE = "elsewhere"
 # Key in Finding.evidence: σ of the white position noise ÷ assumed measurement noise
 WHITE_TO_ASSUMED_NOISE_RATIO_KEY = "white_over_assumed"
-# Cause: the position source. The finding is about an aiding source of EKF2 from the same sensor as
-# KF's positions
+# Cause of a finding on an EKF2 aiding source: its measurements are from the sensor that also
+# measures KF's positions
 SOURCE_SENSOR_CAUSE = "the source's sensor"
 # Cause: the position source reports a wrong variance, and EKF2 uses this variance
 REPORTED_VARIANCE_USED_BY_EKF2_CAUSE = "EKF2's noise"
@@ -197,7 +197,8 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
             or WHITE_TO_ASSUMED_NOISE_RATIO_KEY in cause_group[0].evidence
         ):
             continue
-        # Lines are ids, or "id: kind of cause" if the evidence of the effect must state this kind
+        # A line contains the id of an effect. A line "id: kind of cause" applies only to findings
+        # with this kind of cause in their evidence
         effect_lines, severity = effects_text.splitlines(), cause_group[0].severity
         for group in groups.copy():
             effect, *effects_of_effect = group

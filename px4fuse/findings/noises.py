@@ -250,8 +250,8 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
     # The axis of largest motion is first (False is sorted before True). Report only one axis
     for result in sorted(analysis.axes.values(), key=lambda result: result is not analysis.main):
         updates, summary = result.kf_run.updates, result.filters["kf"]
-        # A small SIGMA_A is wrong only if KF is overconfident and lags: without motion, it is
-        # correct
+        # A small SIGMA_A is a fault only if KF is overconfident and lags behind the motion. Without
+        # motion there is no acceleration, so a small SIGMA_A is correct
         if (
             isinstance(summary, Unavailable)
             or summary.verdict != "overconfident"
@@ -346,19 +346,21 @@ def _explain_wrong_sigma(
         return UNKNOWN_CAUSE, KEEP_NOISE_BECAUSE_OF_DRIFT_ACTION, True
     if may_have_slow_errors and source.origin.is_gnss:
         is_barometer = source.aid(result.axis.name) == BAROMETER
-        # EKF2's noise is a fault if it exceeds both the estimate and the noise that GNSS reports
+        # EKF2's noise parameter is wrong if it is larger than the estimated noise and than the
+        # noise that GNSS reports
         action = _format_action_for_excessive_noise(analysis)
         if is_ekf2 and not is_barometer and action:
             return MEASUREMENT_NOISE_CAUSE, action, False
         sensor = "a barometer" if is_barometer else "GNSS"
         return UNKNOWN_CAUSE, KEEP_NOISE_BECAUSE_OF_CORRELATION_ACTION.format(sensor=sensor), True
-    # 2. Reasons why a smaller noise is not possible, or not right along another axis
+    # 2. An underconfident filter keeps its noise setting in two cases: PX4 permits no smaller
+    # noise, or ground truth shows errors above the reported σ along one of the axes
     if is_underconfident and is_ekf2 and (action := _explain_noise_minimum(analysis)):
         return UNKNOWN_CAUSE, action, True
     if is_underconfident and any(name == filter_name for name, *_ in find_hidden_errors(analysis)):
         return UNKNOWN_CAUSE, KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION, False
-    # 3. Re-runs show the cause. No fault are a σ that ground truth requires, and SIGMA_Z of GNSS,
-    # which px4fuse takes from EKF2
+    # 3. Find the cause by re-runs. An underconfident filter is no fault if ground truth requires
+    # its σ. A large SIGMA_Z of GNSS is no fault either, because px4fuse takes it from EKF2
     rerun = find_cause_rerun(analysis.reruns, filter_name, result.axis.name)
     action = _find_action_for_wrong_sigma(analysis, filter_name, result, rerun)
     is_kf_noise_from_ekf2 = is_underconfident and not is_ekf2 and source.origin.is_gnss
@@ -463,8 +465,8 @@ def _find_sigma_action_without_replay(
     noise_m, used_noise_m = max(estimated_noise_m, EKF2_MIN_NOISE_M), find_ekf2_noise_m(result)
     if not estimated_noise_m or np.isnan(used_noise_m):
         return UNEXPLAINED_SIGMA_ACTION
-    # A change to the estimate corrects an underconfident EKF2 only if it reduces the noise, and an
-    # overconfident EKF2 only if it increases the noise. The ratio is then above 1
+    # The estimated noise corrects an underconfident EKF2 only if it is smaller than the used noise,
+    # and an overconfident EKF2 only if it is larger. In both cases, this ratio is above 1
     is_underconfident = ekf2_summary.sigma_ratio < 1.0
     ratio = used_noise_m / noise_m if is_underconfident else noise_m / used_noise_m
     if ratio <= MAX_RATIO_OF_EQUAL_NOISES:

@@ -87,7 +87,8 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
             item for item in causes if is_only_lever_arm and item.id == "source_orientation_wrong"
         ] + unusable_positions
     else:
-        # A copied orientation alone does not affect other findings
+        # If the only fault is that the orientation is a copy of EKF2's attitude, no other finding
+        # is affected
         if faults.orientation == "copied" and not faults.has_position_fault:
             causes = []
         causes += [
@@ -123,8 +124,8 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
     first_cause, *other_causes = causes
     return [
         first_cause,
-        # Findings on EKF2 become effects of the wrong convention. Those with another cause are
-        # omitted, because they may be absent with the right convention
+        # The wrong convention may cause the findings on EKF2, so list them as its effects. Omit
+        # those with another known cause, because this cause may not exist with the right convention
         *(
             replace(item, message=f"{item.title}.", caused_by=first_cause.id)
             for item in effects

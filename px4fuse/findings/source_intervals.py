@@ -40,7 +40,8 @@ from .model import (
 MIN_LOST_POSITION_FRACTION = 0.02
 # Minimum number of intervals between positions to detect downsampling
 MIN_INTERVALS_FOR_DOWNSAMPLING = 50
-# Minimum fraction of missing positions to report downsampling: a radio link loses fewer
+# Downsampling is reported only if at least this fraction of the positions is missing. A radio link
+# loses a smaller fraction
 MIN_MISSING_FRACTION_FOR_DOWNSAMPLING = 0.25
 # Downsampling gives intervals between positions of two lengths: n or n + 1 periods of the source.
 # Minimum fraction of intervals with these lengths, to report downsampling
@@ -280,9 +281,9 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
 def detect_downsampling(analysis: Analysis) -> Findings:
     """Detect positions that were downsampled before PX4 received them."""
     source = analysis.source
-    # This test is valid only if the timestamps are the times at which PX4 received the positions.
-    # EKF2's own copies of the positions, and all origins behind them in the order of preference
-    # (copies kept by EKF2, rebuilt from innovations, GNSS), have other timestamps
+    # Intervals show downsampling only if the timestamps are the times at which PX4 received the
+    # positions. Positions on the clock of their sender, positions from EKF2's topics and GNSS
+    # positions have other timestamps
     if (
         source.clock_map is not None
         or source.origin.find_preference_rank() >= ALIGNED_BY_EKF2_ORIGIN.find_preference_rank()
@@ -297,10 +298,11 @@ def detect_downsampling(analysis: Analysis) -> Findings:
     # Period of the source, and number of periods in each interval between received positions
     period_s, multiples = period_and_multiples
     lost_fraction = 1.0 - 1.0 / float(np.mean(multiples))
-    # Downsampling to a constant rate makes intervals of n and n + 1 periods. Single lost positions
-    # make intervals of many lengths, and a slower source makes one length
+    # Downsampling to a constant rate gives intervals of two lengths: n and n + 1 periods of the
+    # source. Randomly lost positions give many lengths, and a slower source gives only one
     fraction_by_multiple = np.bincount(multiples.astype(np.intp)) / len(multiples)
-    # Fractions of intervals of n and of n + 1 periods, for the most frequent pair
+    # Find the two successive lengths (n and n + 1 periods) that are most frequent together.
+    # pair_fractions are their fractions of all intervals
     pair_fractions = max(pairwise(fraction_by_multiple), key=sum)
     if (
         lost_fraction < MIN_MISSING_FRACTION_FOR_DOWNSAMPLING

@@ -275,7 +275,7 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
     if EV_POS.switch in parameters:
         value = int(parameters[EV_POS.switch])
         unfused_mask = (EV_CTRL_HORIZONTAL_MASK | EV_CTRL_HEIGHT_MASK) & ~fused_mask
-        if value & unfused_mask:  # EKF2 fuses a constant coordinate
+        if value & unfused_mask:  # a fused coordinate is constant
             action = f"Set {EV_POS.switch} to {value & ~unfused_mask | fused_mask}"
         else:
             action = f"Leave {EV_POS.switch} at {value}"
@@ -538,8 +538,8 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
     error_factor = max(variance_ratio, 1.0 / variance_ratio)
     if error_factor < MIN_VARIANCE_ERROR_FACTOR or low <= reported_sigma_m <= high:
         return
-    # A reported σ above the estimated noise may include time-correlated errors, which the estimate
-    # lacks. The errors against ground truth include them: compare the reported σ with these errors
+    # Time-correlated errors may be a reason for a reported σ above the estimated noise, which does
+    # not contain them. The errors against ground truth contain them, so compare σ with these errors
     size_word, correlation_note = "small", ""
     if variance_ratio > 1.0:
         size_word, rmse_m = "large", _compute_rmse_per_axis_m(analysis)

@@ -245,7 +245,8 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
         >= MIN_CORRELATION_OF_LATENCY_WITH_TIME
     ):
         change_verb, low_latency_s, high_latency_s = "grows", initial_latency_s, final_latency_s
-    # If EKF2 drops nearly all positions, the latency is constant and too long, but does not vary
+    # If EKF2 drops only some positions, their latency varies. If EKF2 drops nearly all of them, the
+    # latency is constant and too long, which is not reported here
     elif is_any_dropped and dropped_fraction < 1.0 - MIN_DROPPED_POSITION_FRACTION:
         change_verb = "varies"
         low_latency_s, high_latency_s = position_age_s.quantile([0.05, 0.95]).tolist()
@@ -273,7 +274,8 @@ def find_timesync_convergence(analysis: Analysis) -> tuple[float, float] | None:
     if position_age_s is None:
         return None
     is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_TO_PUBLICATION_DELAY_S).to_numpy()
-    # TIMESYNC converged where most earlier and fewest later timestamps are arrival times
+    # Before TIMESYNC converges, the timestamps are arrival times. Choose the time that has the most
+    # arrival times before it and the fewest after it
     converged_index = int(np.argmax(np.cumsum(np.where(is_arrival_time, 1, -1)))) + 1
     is_arrival_time_before_convergence, is_arrival_time_after_convergence = np.split(
         is_arrival_time, [converged_index]

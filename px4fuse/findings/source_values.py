@@ -185,7 +185,8 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
         MIN_ROTATION_DEG, MIN_ROTATION_SIGMAS * lever_arm.rotation_sigma_deg
     ):
         rotation_deg = 0.0
-    # If replays are possible, they decide which of the two changes is right
+    # Either the sensor position or the IMU position is set wrongly. If replays are possible, choose
+    # the change that reduces the position error
     effect_sentence = _describe_replayed_effect(analysis, sensor_change, rotation_deg)
     if effect_sentence is not None:
         sensor_text, error_text = f"{source.kind_name} sensor", "the position error"

@@ -35,8 +35,8 @@ from .model import (
 # Reported position or orientation variances of odometry are used only if they grow along the path:
 # minimum ratio of their median at the end to their median at the start
 MIN_VARIANCE_GROWTH_RATIO = 2.0
-# Minimum ratio of the variance of an odometry edge from reported variances to its default variance,
-# against a division by 0
+# The reported variances give the variance of each odometry edge, which is at least this fraction of
+# its default variance. This prevents a division by 0
 MIN_REPORTED_TO_DEFAULT_VARIANCE_RATIO = 1e-2
 # Fraction of the poses at each end of the path from which the median of the reported variances is
 # computed

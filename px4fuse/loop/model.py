@@ -192,8 +192,8 @@ class Loop(Record, kw_only=True):
         """Return the uncorrected and the corrected paths of the report, without duplicates."""
         paths = self.find_paths()
         if isinstance(self.heading_error_deg, Unavailable):
-            # If the heading error is unknown, the path "by_distance" has only corrected positions,
-            # so it equals "by_distance_plain"
+            # If the heading error is unknown, the path "by_distance" is corrected in position only.
+            # It is then the same path as "by_distance_plain"
             paths.pop("by_distance", None)
         return tuple(paths.values())
 

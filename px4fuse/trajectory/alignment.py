@@ -156,8 +156,9 @@ def _require_sufficient_motion(
     """Raise TrajectoryError if the motion is too small to estimate the rotation."""
     reference_extents_m = _compute_principal_extents_m(reference_m)
     residuals_m = reference_m - transform.apply(estimate_m)
-    # extent_m is the motion that determines the rotation. It must exceed rounding errors, which are
-    # proportional to the largest motion max_extent_m, and must not be noise: small residuals
+    # The motion that determines the rotation (extent_m) must exceed rounding errors, which are
+    # proportional to the largest motion (max_extent_m). It must also be large relative to the
+    # residuals, because otherwise it may be only noise
     if kind == "yaw":
         # Horizontal motion determines the yaw: its extent must not be negligible relative to the
         # extent of the whole motion

@@ -79,7 +79,8 @@ def associate(
         Fewer than three poses match.
     """
     estimate_interval_s = compute_median_interval_s(estimate.time_s)
-    # Default of the maximum gap, which can also change the method
+    # Choose a maximum gap if the user gave none. If the reference is too sparse for interpolation,
+    # pair the nearest poses instead
     if max_gap_s is None:
         max_interpolated_interval_s = max(MIN_POSE_INTERVAL_LIMIT_S, 2.0 * estimate_interval_s)
         if method == "nearest":

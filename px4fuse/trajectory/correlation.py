@@ -50,9 +50,9 @@ def compute_moments(
         np.where(is_known, values - np.mean(values[is_known]), 0.0)
         for values, is_known in ((a, is_known_a), (b, is_known_b))
     )
-    # At each lag, sums over the common samples are correlations with the mask of the other series.
-    # _correlate conjugates its second argument: the first is b or its mask, the second a or its
-    # mask. Unknown samples are 0
+    # At each lag, only samples that are known in both series are summed. Unknown samples are 0, so
+    # the correlation of one series with the mask of the other is its sum over these samples.
+    # _correlate conjugates its second argument, which is a or the mask of a
     mask_a = is_known_a.astype(float)
     mask_b = is_known_b.astype(float)
     common_sample_count = np.rint(_correlate(mask_b, mask_a).real)

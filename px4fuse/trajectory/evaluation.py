@@ -50,8 +50,8 @@ MIN_POSE_COUNT_TO_TEST_CONSTANT_ORIENTATION, MIN_EXTENT_TO_TEST_CONSTANT_ORIENTA
 # Frozen positions of the estimate: minimum duration (s) of a repeated position, and minimum motion
 # (m) of the reference meanwhile
 MIN_FREEZE_DURATION_S, MIN_REFERENCE_MOTION_DURING_FREEZE_M = 2.0, 0.5
-# Jumps of the estimate: minimum difference (m) between the steps of estimate and reference from
-# pose to pose, and its minimum ratio to the median difference of all steps
+# Jumps of the estimate: a step is the distance between successive poses. Minimum difference (m)
+# between the steps of estimate and reference, and its minimum ratio to the median difference
 MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_STEP_ERROR_RATIO = 0.5, 20.0
 MAX_STATED_JUMPS = 5
 # Minimum constant rotation (rad) between the orientations of two trajectories, if their body axes

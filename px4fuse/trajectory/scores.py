@@ -208,7 +208,8 @@ def find_pose_pairs(
 
 
 def _find_consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
-    # The sum restarts with each pair, so rounding errors equal those of the evo package
+    # For each pair, the sum of steps (distance or time) starts again at 0, as in the evo package.
+    # Differences of one cumulative sum would have other rounding errors
     pair_ends = [0]
     distance_or_time = 0.0
     for index, step in enumerate(steps.tolist(), 1):
@@ -242,7 +243,7 @@ def compute_relative_pose_error(
         reference.position_m, reference.time_s, delta, all_pairs=all_pairs
     )
     analysis_name = f"RPE over {delta}"
-    # Arguments of the result: translation_m, interval_m, rotation_deg
+    # The three remaining arguments of make_result are translation_m, interval_m and rotation_deg
     make_result = partial(RelativePoseError, delta.value, delta.unit, all_pairs, "reference")
     if not len(start_indices):
         no_pairs_result = Unavailable(

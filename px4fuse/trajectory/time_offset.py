@@ -52,8 +52,8 @@ MISFIT_FLOOR = 1e-3
 # velocity that it explains is removed. Minimum RMS of the remaining velocity ÷ RMS speed: below it,
 # the time offset is not determinable
 MIN_RESIDUAL_VELOCITY_FRACTION = 0.05
-# Minimum correlation between the remaining velocities of both trajectories, without the velocity
-# that a change of the alignment explains
+# Both trajectories must show the same motion. Minimum correlation between their velocities, after
+# removal of the velocity that a change of the alignment explains
 MIN_RESIDUAL_VELOCITY_CORRELATION = 0.5
 # Maximum lag in the variance estimate of Newey and West (1987) ÷ correlation length
 MAX_LAG_IN_CORRELATION_LENGTHS = 4
@@ -347,10 +347,9 @@ def _compute_interval_half_width_s(
         * (dense_track_square_sum * sparse_track_square_sum) ** 0.5
     ):
         return float("inf")
-    # 4. Least squares: σ of the time offset is √(variance of the sum of v·r) ÷ Σ v², with remaining
-    # velocity v and position residual r. v·r is the derivative of the log-likelihood with respect
-    # to the time offset, for each pose. The poses are correlated, so the variance of the sum
-    # contains the products at other lags
+    # 4. The least-squares estimate of the time offset has σ = √(variance of Σ v·r) ÷ Σ v², with the
+    # velocity v from step 2 and the position residual r. Successive products v·r are correlated, so
+    # the variance of their sum also contains their autocovariances at other lags
     likelihood_score = (
         dense_residuals.reshape(pose_count, 3)
         * (fit.dense_track_position_m - fit.aligned_position_m)

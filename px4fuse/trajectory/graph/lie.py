@@ -137,11 +137,10 @@ def right_jacobian_inverse(tangent: Array) -> Array:
         Tangent vectors with a rotation below 2 pi.
     """
     # The Jacobian is the power series x / (1 - exp(-x)) = 1 + x/2 + x^2/12 - x^4/720 + ... of the
-    # Lie bracket matrix x = ad. The identity ad^5 = -2 theta^2 ad^3 - theta^4 ad replaces the
-    # higher powers, so the series is a polynomial 1 + x/2 + a x^2 + b x^4. By the identity, the
-    # eigenvalues of ad are 0 and, twice, +-i theta. At +-i theta, the polynomial has the value and
-    # the derivative of the series. These two equations give a = f - theta f'/2 and
-    # b = -f'/(2 theta), with the function f of _compute_square_term_factor
+    # Lie bracket matrix x = ad. Since ad^5 = -2 theta^2 ad^3 - theta^4 ad, it is a polynomial
+    # 1 + x/2 + a x^2 + b x^4. At the eigenvalues +-i theta of ad, polynomial and series have the
+    # same value and derivative. Therefore a = f - theta f'/2 and b = -f'/(2 theta), with f(theta)
+    # from _compute_square_term_factor
     ad = _make_lie_bracket_matrix(tangent)
     ad_squared = ad @ ad
     theta = np.linalg.norm(tangent[..., _get_dimension(tangent) :], axis=-1)[..., None, None]

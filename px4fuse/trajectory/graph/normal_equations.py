@@ -22,19 +22,22 @@ _FIXED_POSE_INFORMATION = 1e100
 
 
 class _FrontalMatrix(NamedTuple):
-    """Dense matrix in which a group of poses is eliminated together (front, supernode)."""
+    """Front of a multifrontal Cholesky factorisation.
 
-    # Range of the unknowns that this group eliminates, and indices of the other unknowns in their
-    # equations, which later groups eliminate
+    It is a dense matrix in which a group of poses is eliminated together. Later fronts eliminate
+    the remaining poses in the equations of this group.
+    """
+
+    # Range of the unknowns that are eliminated in this front, and indices of the remaining unknowns
     unknowns: slice
     remaining_unknowns: IntArray
-    # Stored blocks (one for each pair of poses) in the columns of the eliminated poses, and their
-    # row and column in this dense matrix, counted in blocks
+    # Range of the matrix blocks (one for each pair of poses) that belong to the columns of the
+    # eliminated poses, and row and column of each block in the front, counted in blocks
     blocks: slice
     block_rows: IntArray
     block_columns: IntArray
-    # Index of the parent, which is the group that eliminates the first of ``remaining_unknowns``,
-    # and rows of ``remaining_unknowns`` in the dense matrix of the parent
+    # Index of the parent front, which eliminates the first of the remaining unknowns, and rows of
+    # the remaining unknowns in the parent front
     parent_index: int
     rows_in_parent: IntArray
 
@@ -57,8 +60,9 @@ class NormalEquations:
             edges, _MAX_LEAF_UNKNOWNS // unknowns_per_pose
         )
         edge_positions = position[edges]
-        # Each edge adds to the diagonal blocks of its two poses, and to their common block. Only
-        # blocks below the diagonal are stored: in the column of the pose that is eliminated first
+        # Each edge adds to the two diagonal blocks of its poses, and to the off-diagonal blocks
+        # that connect them. Only the off-diagonal block below the diagonal is stored. It is in the
+        # column of the pose that is eliminated first
         columns = np.concatenate([*edge_positions, edge_positions.min(axis=0)])
         rows = np.concatenate([*edge_positions, edge_positions.max(axis=0)])
         # Number the blocks column by column. Several edges can add to the same block
@@ -79,8 +83,8 @@ class NormalEquations:
             first_pose, remaining_poses = poses[0], poses[eliminated_count:]
             eliminated_range = np.array([first_pose, first_pose + eliminated_count])
             front_blocks = slice(*np.searchsorted(block_columns, eliminated_range))
-            # The parent front eliminates the first of the remaining poses. The last front has no
-            # remaining poses and no parent, so its parent index is not used
+            # The parent of a front is the front that eliminates the first of its remaining poses.
+            # The last front has no remaining poses and no parent: its index 0 is not used
             parent_index = int(front_by_pose[remaining_poses[0]]) if len(remaining_poses) else 0
             parent_rows = np.searchsorted(poses_by_front[parent_index], remaining_poses)
             self._fronts.append(
@@ -111,8 +115,9 @@ class NormalEquations:
         first_pose_matrix, second_pose_matrix, information, right_hand_side : ndarray
             A, B and weight, shape (m, d, d), and c, shape (m, d, k), of each of the m edges.
         """
-        # An edge with matrices A, B and weight W adds AᵀWA and BᵀWB to the diagonal blocks of its
-        # poses, AᵀWB to their common block, and AᵀWc and BᵀWc to the right-hand sides
+        # An edge A x_i + B x_j = c with weight W adds AᵀWA and BᵀWB to the diagonal blocks of its
+        # poses, AᵀWB to the off-diagonal block that connects them, and AᵀWc and BᵀWc to the
+        # right-hand sides
         pose_matrices = np.stack([first_pose_matrix, second_pose_matrix])
         weighted_matrices = pose_matrices.swapaxes(2, 3) @ information
         # Off-diagonal block of each edge: rows of the first pose, columns of the second pose.
@@ -121,8 +126,9 @@ class NormalEquations:
         off_diagonal_blocks = weighted_matrices[0] @ second_pose_matrix
         is_first_earlier = np.less(*self._position[self._edges])
         off_diagonal_blocks[is_first_earlier] = off_diagonal_blocks[is_first_earlier].swapaxes(1, 2)
-        # In the order of the rows and columns in __init__: diagonal blocks of the first and of the
-        # second poses, then common blocks. bincount adds the elements of the blocks of all edges
+        # List the blocks of all edges in the order of __init__: diagonal blocks of the poses i,
+        # diagonal blocks of the poses j, off-diagonal blocks. Contributions to the same block are
+        # added by bincount
         edge_blocks = [*(weighted_matrices @ pose_matrices), off_diagonal_blocks]
         elements = np.asarray(np.bincount(self._element_indices, np.ravel(edge_blocks)), float)
         matrix_blocks = elements.reshape(-1, *information.shape[1:])
@@ -163,8 +169,9 @@ class NormalEquations:
             )[front.block_rows, :, front.block_columns] = matrix_blocks[front.blocks]
             for rows, schur_complement in schur_complements.pop(index, ()):
                 matrix[rows[:, None], rows] += schur_complement
-            # Cholesky factor U of D = UᵀU. LAPACK and BLAS use the triangle above the diagonal of
-            # the transposed matrix, which is in Fortran order
+            # Compute the Cholesky factor U of D = UᵀU. LAPACK and BLAS expect columns in sequence
+            # (Fortran order). In this order, the array is the transposed matrix, so its lower
+            # triangle becomes the upper triangle that they use
             cholesky_factor, failed_row = lapack.dpotrf(matrix[:size, :size].T)
             if failed_row:
                 return None
@@ -214,10 +221,10 @@ def _find_elimination_order(
     # _build_elimination_tree
     sparse_order = _find_sparse_order(edges)
     remaining_poses, subtree_sizes = _build_elimination_tree(sparse_order[edges])
-    # Each pose is eliminated in the front of its parent if both are in a small subtree, or if their
-    # columns of the Cholesky factor have the same nonzero rows: those of the pose are its parent
-    # and those of the parent, or fewer. Parents come first, because their number is larger.
-    # last_poses: the last pose of the front of each pose
+    # last_poses[k] is the last pose in the front of pose k. A pose is in the front of its parent if
+    # both are in a small subtree, or if their columns of the Cholesky factor have the same nonzero
+    # rows. To test this, compare the numbers of rows: the rows of the parent include those of the
+    # pose. The loop starts with the last pose, because parents have larger numbers
     last_poses = np.arange(len(sparse_order))
     for pose in reversed(range(len(sparse_order) - 1)):
         parent = min(remaining_poses[pose])
@@ -226,8 +233,8 @@ def _find_elimination_order(
         has_rows_of_parent = len(remaining_poses[pose]) == len(remaining_poses[parent]) + 1
         if is_in_small_subtree or (is_above_small_subtrees and has_rows_of_parent):
             last_poses[pose] = last_poses[parent]
-    # In the order of their last poses, each front is eliminated before its parent. The second
-    # argsort inverts the permutation: from the order of the poses to the position of each pose
+    # Sort the poses by the last pose of their front, so that each front is eliminated before its
+    # parent. The second argsort converts the sorted list to the position of each pose in it
     position = np.argsort(np.argsort(last_poses, kind="stable"))
     last_poses, eliminated_counts = np.unique(last_poses, return_counts=True)
     poses_by_front = [
@@ -265,7 +272,8 @@ def _build_elimination_tree(edges: IntArray) -> tuple[list[set[int]], list[int]]
     for first, second in np.sort(edges, axis=0).T.tolist():
         remaining_poses[first].add(second)
     subtree_sizes = [1] * len(remaining_poses)
-    # A pose is complete when it is reached, because its children have smaller numbers
+    # Children have smaller numbers than their parent. When the loop reaches a pose, all children
+    # have therefore added their remaining poses to it
     for pose in range(len(remaining_poses) - 1):
         parent = min(remaining_poses[pose])
         remaining_poses[parent] |= remaining_poses[pose] - {parent}

@@ -145,9 +145,9 @@ def _minimise(
     iterations = 0
     cost = float(np.sum(0.5 * weights * residuals.chi2))
     while iterations < max_iterations and cost > _COST_TOLERANCE:
-        # Linearise the residual r: derivatives J by x_j and -J Ad(X_j^-1 X_i) by x_i, with the
-        # inverse right Jacobian J. The step solves -J Ad x_i + J x_j = -r by least squares, so
-        # ``gradient`` (the right-hand side) is the negative gradient of the cost
+        # Linearise the residual r of each edge for small changes x_i and x_j of its two poses:
+        # r + J x_j - J Ad(X_j^-1 X_i) x_i, with the inverse right Jacobian J. ``gradient``, the
+        # right-hand side of the normal equations, is the negative gradient of the cost
         second_pose_jacobian = lie.right_jacobian_inverse(residuals.residual)
         first_pose_jacobian = second_pose_jacobian @ lie.adjoint(
             lie.inverse(residuals.relative_poses)
@@ -196,10 +196,10 @@ def _solve_gnc(
     can_be_false_closure: BoolArray,
 ) -> tuple[_Optimum, Array]:
     """Reject false closures by graduated non-convexity; return the optimum and the edge weights."""
-    # Both limits are quantiles of the χ² distribution. A closure with χ² below chi2_bound keeps the
-    # weight 1 in the search for the weights. Solutions are compared by their truncated cost: a
-    # dropped closure adds cost_if_dropped, a larger quantile, so that a closure is dropped only if
-    # its χ² is clearly too large. Odometry edges are never dropped
+    # A closure with χ² below chi2_bound keeps its full weight 1. To compare solutions, each dropped
+    # closure adds cost_if_dropped to the cost instead of its χ². This is a larger quantile of the
+    # χ² distribution, so that only closures with a clearly too large χ² are dropped. Odometry edges
+    # are never dropped
     half_degrees_of_freedom = model.count_observed_directions(graph.information) / 2.0
     chi2_bound = np.where(
         can_be_false_closure & (half_degrees_of_freedom > 0.0),
