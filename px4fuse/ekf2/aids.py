@@ -298,10 +298,10 @@ def _find_largest_innovation_mean_change(
     windows = windows[windows["size"] >= MIN_INNOVATIONS_PER_WINDOW]
     window_means = windows["mean"].to_numpy()
     largest_mean_change = None
-    # A change must exceed the largest change so far, or this limit for the first
+    # Each change that is found raises this limit to its own size, so the largest change remains
     min_mean_change = MIN_INNOVATION_CHANGE_IN_SIGMA
-    # Test for a change in each window: compare all windows before it with the two after it. The
-    # window itself may contain both means, so it is in neither
+    # For each window, compare the mean innovation before it with that of the next two windows. A
+    # change may be inside the window, so neither mean contains the window
     for index in range(MIN_WINDOWS_BEFORE_MEAN_CHANGE, len(window_means) - 2):
         mean_before_window = np.mean(window_means[:index])
         mean_change = float(np.mean(window_means[index + 1 : index + 3]) - mean_before_window)
@@ -316,7 +316,8 @@ def _find_largest_innovation_mean_change(
         ):
             first_changed_index = index
             if abs(window_means[index] - mean_before_window) <= abs(mean_change) / 3.0:
-                # This window still has the earlier mean
+                # The mean of this window is near the mean before the change, so the change is in
+                # the next window
                 first_changed_index += 1
             largest_mean_change = (
                 float(time_s[0] + INNOVATION_MEAN_WINDOW_S * windows.index[first_changed_index]),
@@ -347,7 +348,8 @@ def _find_noise_origin(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> 
         return ""
     if parameter_value is None:
         return aid.noise_source_text
-    # The parameter is σ, σ without a factor (GNSS height), or a variance (EKF2_DRAG_NOISE)
+    # σ is the parameter, the parameter times a factor (GNSS height), or the square root of the
+    # parameter (EKF2_DRAG_NOISE is a variance)
     possible_sigmas = (
         parameter_value,
         GNSS_HEIGHT_NOISE_FACTOR * parameter_value,
@@ -368,8 +370,8 @@ def _find_longest_gap(fusion_times_s: Array, aid_log: AidLog, start_s: float, en
     gap_limits_s = np.unique(
         np.r_[start_s, fusion_times_s, end_s, times_with_unknown_fusion_s[is_inside]]
     )
-    # EKF2 disables an aiding source up to 1 s after the last fused sample. A source that is then
-    # still enabled is missing: the gap counts
+    # EKF2 may disable an aiding source up to 1 s after its last fused sample. A gap therefore
+    # counts only if the source is still enabled 1 s after the gap has started
     is_enabled_in_gap = _was_enabled(aid_log, gap_limits_s[:-1] + 1.0)
     return max(
         select_intervals(gap_limits_s, is_enabled_in_gap),

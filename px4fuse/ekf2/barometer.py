@@ -23,11 +23,11 @@ from .replay_segments import INNOVATION_LOW_PASS_TIME_CONSTANT_S
 BAROMETER_FUSION_RATE_HZ = 10.0
 # Rate (Hz) at which EKF2 fuses the barometer before PX4 v1.15
 BAROMETER_FUSION_RATE_HZ_BEFORE_V1_15 = 15.0
-# The interval of EKF2's barometer samples is estimated at each logged update of the barometer bias.
-# The median is used only if the interquartile range ÷ median of the estimates is below this value
+# Each logged update of the barometer bias gives an estimate of EKF2's barometer sample interval.
+# Their median is used only if their interquartile range ÷ median is below this value
 MAX_RELATIVE_SPREAD_OF_INTERVALS = 0.1
-# Barometer samples from two parts of the log are the same sample if their times differ by less than
-# this fraction of the sample interval
+# Several topics of the log contain barometer samples. Samples of two topics are the same sample if
+# their times differ by less than this fraction of the sample interval
 SAME_SAMPLE_TOLERANCE_IN_INTERVALS = 0.3
 # Maximum number of barometer samples that are reconstructed between two rows of
 # estimator_aid_src_baro_hgt
@@ -157,8 +157,8 @@ def _combine_barometer_samples(
     )
     bias_m = _compute_bias_over_time(bias_updates, interval_s)
     predict_measured_down_m = _make_measurement_prediction(ekf2, fusion_record, bias_m)
-    # 1. Heights of the three sources, in increasing priority: if the log contains a sample several
-    # times, the last is used
+    # The log contains the heights in three forms, listed in increasing priority: if it contains a
+    # sample several times, the last is used
     time_s = np.concatenate([bias_updates.index, logged_down_m.index, row_times_s])
     down_m = np.concatenate(
         [
@@ -168,8 +168,8 @@ def _combine_barometer_samples(
             logged_updates["observation_down"] - np.interp(row_times_s, bias_m.index, bias_m),
         ]
     )
-    # 2. Grid of all samples that EKF2 fused. One row per interval between two logged rows, one
-    # column per sample in the interval; the last sample is that of the logged row
+    # The grid has a place for each sample that EKF2 fused: one row per interval between two logged
+    # rows, one column per sample in the interval. The last sample is that of the logged row
     span_s = np.diff(row_times_s)
     sample_count = np.maximum(np.rint(span_s / interval_s), 1.0).astype(int)
     # An interval is regular if it is a multiple of the sample interval. Others remain empty
@@ -180,7 +180,8 @@ def _combine_barometer_samples(
     sample_interval_by_row_s = span_s / sample_count
     sample_indices = np.arange(sample_count[is_regular].max(initial=1))
     innovation_m = np.full((len(sample_count), len(sample_indices)), np.nan)
-    # 3. Place of each height in the grid: row, and number of the sample from 1 to sample_count
+    # Find the place of each height in the grid: row, and number of the sample from 1 to
+    # sample_count
     row_index = np.searchsorted(
         row_times_s[1:], time_s - SAME_SAMPLE_TOLERANCE_IN_INTERVALS * interval_s
     )
@@ -196,7 +197,7 @@ def _combine_barometer_samples(
     innovation_m[row_index[is_on_sample_grid], sample_number[is_on_sample_grid] - 1] = (
         down_m - predict_measured_down_m(time_s)
     )[is_on_sample_grid]
-    # 4. Random values for the samples that are still missing
+    # Simulate the samples that are still missing
     if "filtered_down" in logged_updates:
         age_in_samples = sample_count[:, None] - 1.0 - sample_indices
         is_missing = np.isnan(innovation_m) & (age_in_samples >= 0.0) & is_regular[:, None]
@@ -208,7 +209,8 @@ def _combine_barometer_samples(
             # PX4 logs the filtered innovation with the opposite sign: state minus measurement
             -logged_updates["filtered_down"].to_numpy(),
         )
-    # 5. Heights of the grid, and of the samples that are not on the grid
+    # Each sample of the grid has the height prediction + innovation. Logged heights between the
+    # times of the grid are added
     has_sample = np.isfinite(innovation_m)
     grid_times_s = row_times_s[:-1, None] + sample_interval_by_row_s[:, None] * (sample_indices + 1)
     grid_times_s = grid_times_s[has_sample]
@@ -248,11 +250,10 @@ def _simulate_missing_innovations(
     low_pass_filtered_innovation_m : ndarray, shape (n + 1,)
         Logged low-pass filtered innovations.
     """
-    # EKF2 filters each innovation ν with f = (1 - w) f_previous + w ν. Age: number of samples from
-    # a sample to the next row of the log
+    # EKF2 logs the filtered innovation f. Each innovation ν updates it: f ← (1 - w) f + w ν. After
+    # the k samples of an interval, f = (1 - w)^k f_previous + Σ w (1 - w)^age ν. The last sample
+    # has age 0
     w = interval_s / (interval_s + INNOVATION_LOW_PASS_TIME_CONSTANT_S)
-    # After the k samples of an interval (age k - 1 to 0):
-    # f = (1 - w)^k f_previous + Σ w (1 - w)^age ν
     sample_weight = w * (1.0 - w) ** np.maximum(age_in_samples, 0.0)
     sample_count = age_in_samples[:, 0] + 1.0
     previous_weight = (1.0 - w[:, 0]) ** sample_count
@@ -262,8 +263,8 @@ def _simulate_missing_innovations(
         scale=np.nanstd(innovation_m), size=innovation_m.shape
     )
     filled_innovation_m = np.where(is_missing, random_innovation_m, innovation_m)
-    # All random innovations of an interval are shifted by the same offset, so that the equation
-    # holds: offset · Σ weight of missing samples = f - computed f
+    # All random innovations of an interval are shifted by one offset, so that the computed f equals
+    # the logged f. The offset is their difference ÷ sum of the weights of the random innovations
     filtered_innovation_error_m = (
         low_pass_filtered_innovation_m[1:]
         - previous_weight * low_pass_filtered_innovation_m[:-1]

@@ -75,8 +75,9 @@ class FilterConfiguration:
     def compute_delays(self, inputs: ReplayInputs) -> FusionDelays:
         """Return the delay of the position source, and the delay of the fusion horizon."""
         if self.timestamp_offset_s is not None:
-            # Measurement time: timestamp + offset. EKF2 also subtracts half a prediction step,
-            # which is added here. With an infinite delay of the horizon, no sample is late
+            # The measurement time is timestamp + offset. The replay later subtracts half a
+            # prediction step, as EKF2 does, so this half step is added here. With an infinite delay
+            # of the fusion horizon, each sample arrives in time
             return FusionDelays(-self.timestamp_offset_s - 0.5 * inputs.mean_step_s, np.inf)
         delay_s = self.settings[inputs.aid.delay] * 1e-3
         delays_ms = [self.settings.get(aid.delay, 0.0) for aid in (GNSS_POS, EV_POS)]

@@ -181,19 +181,18 @@ def run_segment(  # noqa: PLR0912 (the order of EKF2's fusions in one place)
     state_variances = np.empty(states.shape, np.float32)
     states[0], state_variances[0] = x, _get_state_variances(P)
     for event in range(event_count):
-        # 1. Prediction
         prediction.predict(event, x, P)
-        # 2. Magnetometer and optical flow
+        # EKF2 fuses magnetometer and optical flow first
         for aid, mean_samples, gate, state_slices in mean_sensors:
             if mean_samples.sample_count[event].any():
                 mean_sample = EventSamples(*(quantity[event] for quantity in mean_samples))
                 x, P, update = fuse_mean_sample(x, P, mean_sample, gate, *state_slices)
                 if aid == MAG:
                     magnetometer_updates[event] = update
-        # 3. Vision samples of earlier prediction steps than the GNSS sample
+        # EKF2 fuses the vision samples of earlier prediction steps before the GNSS sample
         if vision_filter is not None:
             x, P = vision_filter.fuse(event, x, P, False, positions.decisions.last_position_s)
-        # 4. Barometer, GNSS velocity and position, GNSS height
+        # EKF2 fuses barometer, GNSS velocity and position, and GNSS height in this order
         if height_filter is not None:
             x, P = height_filter.fuse_barometer(event, x, P)
         if positions.has_sample[event]:
@@ -201,12 +200,13 @@ def run_segment(  # noqa: PLR0912 (the order of EKF2's fusions in one place)
         if height_filter is not None:
             gnss_variance_m2 = positions.measurement_variance[event, :, DOWN_COLUMN]
             x, P = height_filter.fuse_gnss(event, x, P, gnss_variance_m2)
-        # 5. Vision as the only position source; logged height and heading
+        # Vision is fused here if it is the position source. Without measurements of heading or
+        # height, the replay uses EKF2's logged values
         x, P = positions.fuse_vision_and_logged_states(event, x, P)
-        # 6. Reset to the sample of the position source
+        # Some filters do not fuse the sample, but reset their position to it
         if positions.reset[event].any():
             positions.reset_states(event, x, P)
-        # 7. Vision samples of the same prediction step as the GNSS sample
+        # EKF2 fuses the vision samples of the same prediction step after the GNSS sample
         if vision_filter is not None:
             # The vision bias is state minus measurement, so a reset changes it like the state
             vision_filter.bias.bias_m = vision_filter.bias.bias_m + positions.reset_m[event]
@@ -216,7 +216,8 @@ def run_segment(  # noqa: PLR0912 (the order of EKF2's fusions in one place)
                 positions.decisions.last_position_s = np.maximum(
                     positions.decisions.last_position_s, vision_filter.last_fusion_s
                 )
-        # 8. Bad acceleration: flag for the next events, and accelerometer bias
+        # Large height innovations set the bad-acceleration flag for the next events. While it is
+        # set, EKF2 holds the accelerometer bias constant
         if height_filter is not None and not bad_acceleration_flag.uses_logged_flag.all():
             height_filter.update_bad_acceleration_flag(
                 event, batch.event_time_s[event], positions.get_velocity_down_update(event)
@@ -469,7 +470,7 @@ class _PositionFusion:
         """
         batch, segment = self.batch, self.batch.segment
         steps = batch.event_steps[event]
-        # 1. Logged states: state index, value and R
+        # Collect the logged states as state index, value and R
         measurements = []
         is_heading_logged = segment.magnetic_field is None
         heading_error_rad = batch.estimates_attitude * segment.attitude_error_rad[steps, HEADING]
@@ -481,7 +482,7 @@ class _PositionFusion:
             logged_variance = segment.down_variance_m2[steps]
             R = _compute_noise_for_target_variance(P, POSITION_DOWN, logged_variance)
             measurements.append((POSITION_DOWN, segment.down_m[steps], R))
-        # 2. External vision, if it is the position source
+        # Add external vision if it is the position source
         if batch.inputs.aid != GNSS_POS and self.has_sample[event]:
             fused_states = [(POSITION_NORTH, self.fused), (POSITION_EAST, self.fused)]
             if batch.inputs.fuses_vision_height:
@@ -492,9 +493,9 @@ class _PositionFusion:
                 R = np.where(is_fused[event], self.measurement_variance[event, :, column], np.inf)
                 measurements.append((row, self.measured_values[event, :, column], R))
         x, P = _fuse_states(x, P, measurements)
-        # 3. If the variance of a state is already below the logged variance, its fusion has no
-        # effect. Therefore the value is set. With a logged heading, the height is not set, because
-        # it may be the fused vision height
+        # Fusion of a logged state has no effect if the variance of the state is already below the
+        # logged variance. The state is therefore set to the logged value. With a logged heading,
+        # the height is not set, because it may be the fused vision height
         if is_heading_logged:
             x[:, HEADING] = heading_error_rad
             P = 0.5 * (P + np.swapaxes(P, 1, 2))
@@ -541,7 +542,8 @@ def _average_samples(batch: FilterBatch, aid: Aid, samples: SensorSamples) -> Ev
             [average_by_event(batch.segment, samples, steps) for steps in batch.event_steps.T]
         )
     )
-    # An event without samples is not fused
+    # An event with sample count 0 is not fused, so the count is set to 0 where the source is
+    # disabled
     mean_samples.sample_count[:] *= batch.is_enabled_by_aid[aid.name]
     if aid == MAG:
         # R depends on the parameter of each filter. R of optical flow is logged
@@ -656,7 +658,7 @@ class _FusionDecisions:
         now_s, action = self.time_s[event], self.sample_actions[event]
         is_reset_logged = self.logged_resets[event]
         self.last_velocity_s = np.where(is_velocity_fused, now_s, self.last_velocity_s)
-        # 1. Fuse, reject, or start fusion
+        # Decide if each filter rejects the sample, or starts fusion with it
         may_fuse = action == FUSE
         is_rejected = self.has_gate & may_fuse & self._find_rejected(event, is_outside_gate)
         is_fusion_starting = self.has_gate & (
@@ -667,7 +669,8 @@ class _FusionDecisions:
             # same result, but take longer
             self.last_position_s = np.where(may_fuse, now_s, self.last_position_s)
             return is_rejected, may_fuse, np.zeros_like(may_fuse), is_velocity_fused
-        # 2. Resets: logged, or computed (start of fusion, or too long without fusion)
+        # A filter that uses logged decisions resets its position as in the log. Other filters reset
+        # it at the start of fusion, and after too long a time without fusion
         uses_logged_resets = self.uses_logged_decisions & (
             self.is_every_reset_logged
             or is_reset_logged
@@ -683,7 +686,7 @@ class _FusionDecisions:
             is_fusion_starting | is_reset_after_timeout,
         )
         is_fused = may_fuse & ~(is_rejected | self.is_stopped | is_reset)
-        # 3. State of the decisions on later samples
+        # The timeouts for later samples start at the last fusion or reset
         self.last_position_s = np.where(is_fused | is_reset, now_s, self.last_position_s)
         self.last_velocity_s = np.where(is_reset, now_s, self.last_velocity_s)
         # EKF2 stops fusion if the rejections time out after the last allowed reset
@@ -786,8 +789,9 @@ def _compute_steady_state_correlation(segment: ReplaySegment) -> Array:
         (TILT_ABOUT_EAST, ACCELEROMETER_BIAS_NORTH, -GRAVITY_MAGNITUDE_M_S2),
         (TILT_ABOUT_NORTH, ACCELEROMETER_BIAS_EAST, GRAVITY_MAGNITUDE_M_S2),
     ):
-        # acceleration_per_rad · θ and b cancel, so they have a common part. Its variance is the
-        # smaller of both variances: cov(acceleration_per_rad · θ, b)
+        # The two acceleration errors cancel if acceleration_per_rad · θ = b, so both contain a
+        # common part. Its variance, which is their covariance, is assumed to be the smaller of both
+        # variances
         common_variance = min(P[tilt, tilt] * acceleration_per_rad**2, P[bias, bias])
         P[tilt, bias] = P[bias, tilt] = common_variance / acceleration_per_rad
     return _compute_correlation(state_rotation_to_ned.T @ P @ state_rotation_to_ned)

@@ -281,8 +281,9 @@ def _check_position_quality(positions: UnfusedPositions) -> Iterator[UnmetCondit
     if min_quality <= 0.0 or "quality" not in status:
         return
     quality = positions.select_samples(status)["quality"]
-    # EKF2 starts fusion if all samples from the fused (delayed) to the newest, and the sample
-    # before, have the minimum quality. A shorter span without fusion needs all of its samples
+    # EKF2 starts fusion only if several successive samples have the minimum quality: the sample
+    # before the fused (delayed) one, and all from there to the newest. If fewer samples were not
+    # fused, all of them must have the minimum quality
     sample_count = int(np.ceil(positions.max_sample_age_s / positions.interval_s)) + 2
     has_min_quality = (quality >= min_quality).astype(float)
     have_all_min_quality = has_min_quality.rolling(min(sample_count, max(len(quality), 1))).min()

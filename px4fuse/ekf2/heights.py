@@ -122,9 +122,8 @@ class BadAccelerationFlag:
         """
         *previous_barometer, previous_gnss = previous_innovations
         *barometer, gnss = innovations
-        # EKF2 tests the latest innovations of barometer and GNSS after each fusion. Test them in
-        # this sequence:
-        # 1. After the last samples of the previous event
+        # EKF2 tests the latest innovations of barometer and GNSS after each fusion. The first test
+        # uses the last samples of the previous event
         latest_barometer_innovation = np.full_like(gnss, np.nan)
         for sample in previous_barometer:
             latest_barometer_innovation = np.where(
@@ -133,7 +132,8 @@ class BadAccelerationFlag:
         is_acceleration_bad = _has_large_height_innovations(
             latest_barometer_innovation, previous_gnss
         )
-        # 2. After each barometer sample of this event. Its GNSS sample is not yet fused
+        # EKF2 fuses the barometer samples of this event before its GNSS sample, so each is tested
+        # together with the previous GNSS sample
         for sample in barometer:
             latest_barometer_innovation = np.where(
                 np.isnan(sample), latest_barometer_innovation, sample
@@ -141,10 +141,11 @@ class BadAccelerationFlag:
             is_acceleration_bad |= _has_large_height_innovations(
                 latest_barometer_innovation, previous_gnss
             )
-        # 3. After the GNSS sample of this event
+        # The last test follows the fusion of the GNSS sample of this event
         is_acceleration_bad |= _has_large_height_innovations(latest_barometer_innovation, gnss)
         is_acceleration_bad &= ~self.uses_logged_flag
-        # A flag that is still set continues: only its end changes
+        # If the flag is still set from an earlier event, its start stays the same and only its end
+        # changes
         self.since_s = np.where(is_acceleration_bad & (self.until_s < time_s), time_s, self.since_s)
         self.until_s = np.where(is_acceleration_bad, time_s + self.flag_duration_s, self.until_s)
 
@@ -214,7 +215,8 @@ class HeightFilter:
         )
         # Index of the GNSS sample, after the barometer samples of each event
         self.gnss_index = barometer_samples.shape[1]
-        # Append a sample for GNSS, which is measured at the event (age 0)
+        # GNSS is the last sample of each event. Its age is 0, because the event is at its
+        # measurement time
         self.down_m, self.age_s, self.time_s, self.dead_zone_m, weight, has_sample = np.pad(
             barometer_samples, ((0, 0), (0, 1), (0, 0), (0, 0))
         )

@@ -601,8 +601,9 @@ def _read_logged_decisions(
     earliest_fusion_times_s = np.maximum.accumulate(
         np.maximum(measurement_times_s, arrival_s - horizon_s)
     )
-    # 1. Time spans in which EKF2 rejected all samples except the last: from its last fusion
-    # (last_fused_s) to a log row, and dead reckoning, which the last sample ended
+    # EKF2 rejected the samples of two kinds of time span, except the last sample of each. The first
+    # kind is from EKF2's last fusion (last_fused_s) to the log row with this value. The second is
+    # dead reckoning, which its last sample ended
     last_fused_s = ekf2.aids[aid.name].samples.reindex(columns=["last_fused_s"]).dropna()
     fusion_to_log_row_s = np.column_stack([last_fused_s, last_fused_s.index])
     dead_reckoning_s = _find_dead_reckoning_spans(ekf2, fusion_record, aid)
@@ -623,8 +624,8 @@ def _read_logged_decisions(
     may_be_reset_sample[is_logged] &= (innovations_of_samples["rejected"] > 0.0) | (
         innovations_of_samples["innovation_m"] == 0.0
     )
-    # 3. Sample of each reset. A reset is published later than its measurement by the delay of the
-    # fusion horizon
+    # Find the sample to which EKF2 reset its position. A reset is published later than its
+    # measurement by the delay of the fusion horizon
     publication_times_s = earliest_fusion_times_s + horizon_s
     for reset_s in find_horizontal_reset_times_s(ekf2):
         is_published_near_reset = (publication_times_s <= reset_s) & (
@@ -638,7 +639,8 @@ def _read_logged_decisions(
             is_reset[rows_after_dead_reckoning[0]] = True
         elif len(reset_rows):
             is_reset[reset_rows[-1]] = True
-    # 4. The samples of the last fusions, each just before a span to a log row, are not rejected
+    # A time span of the first kind starts when EKF2 fuses a sample. This sample, one row before the
+    # first row of the span, is therefore not rejected
     rows_after_fusion = fusion_to_log_rows[:, 0]
     fused_rows = rows_after_fusion[rows_after_fusion > 0] - 1
     is_undecided = ~is_reset[fused_rows] & np.isnan(rejected_flags[fused_rows])

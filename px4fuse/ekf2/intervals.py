@@ -158,7 +158,7 @@ def _make_fusion_events(
 ) -> FusionEvents:
     received_positions = inputs.received_positions
     time_s = segment.time_s
-    # 1. Prediction step in which EKF2 fuses each sample
+    # Find the prediction step in which EKF2 fuses each sample
     first_row, end_row = np.searchsorted(received_positions.timestamp_s, time_s[[0, -1]])
     timestamp_s = received_positions.timestamp_s[first_row:end_row]
     last_step = len(time_s) - 1
@@ -173,7 +173,7 @@ def _make_fusion_events(
     is_inside = (fusion_step_by_sample > 0) & (fusion_step_by_sample <= last_step)
     # A sample is not fused before the earlier samples
     fusion_step_by_sample = np.maximum.accumulate(np.minimum(fusion_step_by_sample, last_step))
-    # 2. Action of EKF2 on each sample
+    # EKF2 discards a sample that is too old when it is fused
     is_in_time = time_s[fusion_step_by_sample] < measurement_times_s + MAX_DELAY_BEHIND_HORIZON_S
     is_usable = is_inside & is_in_time
     # EKF2 fuses only the newer of two samples in one prediction step
@@ -183,18 +183,19 @@ def _make_fusion_events(
     )
     # The sender requested a reset
     action[np.isin(timestamp_s, received_positions.reset_times_s) & (action == FUSE)] = START_FUSION
-    # 3. Further events: in a gap before the first, between two, or after the last sample, height
-    # and heading are fused at regular intervals
+    # Add events in long gaps between samples, before the first sample and after the last. There,
+    # height and heading are fused at regular intervals
     gap_s = np.diff(np.r_[time_s[0], timestamp_s, time_s[-1]])
     event_counts_in_gaps = np.maximum(
         np.ceil(gap_s / inputs.max_height_fusion_interval_in_position_gap_s).astype(int) - 1, 0
     )
-    # Each sample has one event, after the events of the gap before it
+    # The events of a gap come before the event of the sample that ends the gap
     event_row_by_sample = np.cumsum(event_counts_in_gaps[:-1] + 1) - 1
     event_count = len(timestamp_s) + int(event_counts_in_gaps.sum())
     events = np.zeros(event_count, EVENT_DTYPE).view(np.recarray)
-    # The events in a gap divide it into equal numbers of prediction steps: interpolate the step
-    # between the events of the samples. The start is row -1, the end is row event_count
+    # The events divide a gap into equal numbers of prediction steps, so their steps are
+    # interpolated between those of the samples. Row -1 is the start of the segment, row event_count
+    # its end
     events.end_step = np.rint(
         np.interp(
             np.arange(event_count),
@@ -202,7 +203,7 @@ def _make_fusion_events(
             np.r_[0, fusion_step_by_sample, last_step],
         )
     )
-    # 4. Fields of all events, then those of the events with a sample
+    # Set the fields of all events, then those of the events with a sample
     events.sample, events.time_s = -1, time_s[events.end_step]
     delay_of_fusion_s = earliest_fusion_times_s - measurement_times_s
     for name, values in (
@@ -238,9 +239,9 @@ def _find_fusion_actions(
     can_start_fusion[usable_rows] = (
         np.diff(usable_times_s, prepend=-np.inf) < fusion_rules.max_sample_interval_to_start_s
     )
-    # EKF2 stops fusion if the time since the previous sample exceeds a timeout. EKF2 checks this in
-    # each prediction step: the last check without the new sample is in the step before its fusion.
-    # There is no gap before the first sample
+    # In each prediction step, EKF2 stops fusion if the time since the latest sample exceeds a
+    # timeout. A gap is longest in the step before the fusion of the next sample. There is no gap
+    # before the first sample
     sample_gaps_s = segment.time_s[end_steps[usable_rows[1:]] - 1] - usable_times_s[:-1]
     is_fusing = segment.starts_while_fusing
     for row, gap_s in zip(usable_rows.tolist(), [0.0, *sample_gaps_s.tolist()], strict=False):
@@ -280,15 +281,18 @@ def _integrate_state_jacobian(
         force_m_s2 = specific_force_ned_m_s2[step]
         # -R Δt: change of attitude per gyro bias, and of velocity per accelerometer bias
         change_by_bias = -segment.body_to_ned[1:][step] * dt
-        # p: first half, with the velocity before the step
+        # Half of the position change depends on the velocity before the step
         position_derivatives[rows] += 0.5 * dt * velocity_derivatives[rows]
-        # v: all columns by -[a]× Δt δθ; then the effects of bias and acceleration in this step
+        # The velocity changes by -[a]× Δt δθ, so the derivatives of δθ add to those of the
+        # velocity. The accelerometer bias and the acceleration of this step also change the
+        # velocity
         velocity_derivatives[rows] += (-skew(force_m_s2) * dt) @ attitude_derivatives[rows]
         velocity_derivatives[rows, :, BY_ACCELEROMETER_BIAS] += change_by_bias
         velocity_derivatives[rows, :, BY_ACCELERATION] += (force_m_s2 + GRAVITY_M_S2) * dt[:, :, 0]
-        # p: second half, with the velocity after the step
+        # The other half of the position change depends on the velocity after the step
         position_derivatives[rows] += 0.5 * dt * velocity_derivatives[rows]
-        # δθ: last, because the velocity changes with the attitude before the step
+        # The attitude is updated after the velocity, because the velocity change depends on the
+        # attitude before the step
         attitude_derivatives[rows, :, BY_GYRO_BIAS] += change_by_bias
         attitude_derivatives[rows, :, BY_ATTITUDE_CORRECTION] -= segment.attitude_correction_rad[
             step

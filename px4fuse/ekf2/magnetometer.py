@@ -97,7 +97,7 @@ def fuse_mean_sample(
     """
     estimated_vector_ned = x[:, measured_states]
     sample_count, R = mean_sample.sample_count, mean_sample.noise
-    # 1. Innovation. Measurement: h(x) = C (I - [δθ]×) v + b, with the rotation C from NED to the
+    # The predicted measurement is h(x) = C (I - [δθ]×) v + b, with the rotation C from NED to the
     # nominal body axes, attitude error δθ, vector v (NED) and sensor bias b. C [v]× = dh/dδθ
     H = np.zeros((len(x), mean_sample.value.shape[-1], x.shape[1]))
     H[:, :, THETA] = mean_sample.ned_to_body_rotation @ skew(estimated_vector_ned)
@@ -107,7 +107,8 @@ def fuse_mean_sample(
         H[:, :, bias_states] = np.eye(3)
         predicted_value += x[:, bias_states]
     nu = mean_sample.value - predicted_value
-    # 2. Gate, with the noise of one sample
+    # EKF2 tests each sample separately. The gate therefore uses the noise R of one sample, not the
+    # smaller noise of the mean
     HP = H @ P
     HPH = HP @ H.transpose(0, 2, 1)
     innovation_variance = np.diagonal(HPH, axis1=1, axis2=2) + R[:, None]
@@ -115,7 +116,8 @@ def fuse_mean_sample(
     is_fused = has_sample & (nu * nu <= gate[:, None] ** 2 * innovation_variance).all(axis=1)
     update = np.array([nu, innovation_variance, np.tile(is_fused, (nu.shape[1], 1)).T])
     update[:, ~has_sample] = np.nan
-    # 3. Update, with the noise R / n of the mean. Without a sample, 1 avoids a singular S
+    # The update fuses the mean of n samples, whose noise is R / n. Without a sample, 1 avoids a
+    # singular S
     mean_noise = np.where(has_sample, R / np.maximum(sample_count, 1.0), 1.0)
     S = HPH + mean_noise[:, None, None] * np.eye(nu.shape[1])
     K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * is_fused[:, None, None]

@@ -121,8 +121,8 @@ def prepare_ekf2_model(
         Function that returns the filter configurations that later analyses need. They are computed
         together with the logged configuration, which is faster.
     """
-    # Reasons for omission, and fields of ReplayAgreement from the replay that still fused an
-    # omitted source, by PX4's name of the source
+    # An aiding source is omitted if its replay does not agree with the log. Keep the reason, and
+    # the disagreement from the replay that still fused the source (fields of ReplayAgreement)
     omitted_aids: dict[str, str] = {}
     fields_of_omitted_aids: dict[str, Any] = {}
     while True:
@@ -478,8 +478,9 @@ def _collect_updates_by_aid(
             updates_by_aid[name] = height_filter.make_update_table(name, configuration_index, end_s)
     if inputs.received_positions.velocity_m_s is not None:
         gate = run.configurations[configuration_index].settings[GNSS_VEL.gate]
-        # The run contains no decision on the velocity: test it again. The factor 1 + 1e-9 allows
-        # for rounding errors of innovations that are clipped to the gate
+        # The replay does not store if the gate rejected the GNSS velocity, so its innovations are
+        # tested again. The factor 1 + 1e-9 allows for rounding errors of innovations that are
+        # clipped to the gate
         squared_gate = (1.0 + 1e-9) * max(gate, MIN_INNOVATION_GATE) ** 2
         is_outside_gate = (nu[:, :3] ** 2 > squared_gate * S[:, :3]).any(axis=1)
         # Without GNSS heights, the table contains only the horizontal axes

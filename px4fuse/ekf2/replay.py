@@ -271,10 +271,11 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> ReplayAgreement | Un
                 f"{_format_unlike_limit(flow_position_difference_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m "
                 f"(limit {MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
             )
+    # The keys of the three mappings are field names of ReplayAgreement
     return ReplayAgreement(
-        **agreement_by_axis,  # north and east
-        **agreement_by_aid,  # ev_pos, gnss_pos, gnss_vel, and so on
-        **agreement_statistics,  # samples to decisions_same, good and reason
+        **agreement_by_axis,
+        **agreement_by_aid,
+        **agreement_statistics,
         doubtful=omitted_aids,
         published_rms_difference_m=math.hypot(
             *(axis.position_rms_difference_m for axis in agreement_by_axis.values())

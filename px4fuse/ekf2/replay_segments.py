@@ -725,14 +725,14 @@ def _compute_mean_magnetic_field(
     Mean field = predicted field - mean innovation. The mean innovation is computed from logged
     low-pass filtered innovations.
     """
-    # 1. Pairs of successive rows in the segment, without gaps
+    # Use pairs of successive rows in the segment without a gap between them
     start_times_s, end_times_s = measurement_times_s[:-1], measurement_times_s[1:]
     row_interval_s = end_times_s - start_times_s
     is_used = (start_times_s > segment.time_s[0]) & (end_times_s <= segment.time_s[-1])
     is_used &= (row_interval_s > 0.0) & (row_interval_s < RESTART_GAP_S)
     end_times_s, row_interval_s = end_times_s[is_used], row_interval_s[is_used]
-    # 2. Mean innovation between two rows. EKF2 updates the filtered innovation f with each of n
-    # samples ν: f = (1 - w) f + w ν. With a constant ν and p = (1 - w)^n: f = p f_previous +
+    # The mean innovation ν between two rows follows from the logged filtered innovations f. Each of
+    # n samples updates f ← (1 - w) f + w ν. With a constant ν and p = (1 - w)^n, f = p f_previous +
     # (1 - p) ν
     sample_counts = np.maximum(np.rint(MAG_FUSION_HZ * row_interval_s), 1.0)
     sample_interval_s = row_interval_s / sample_counts
@@ -742,9 +742,9 @@ def _compute_mean_magnetic_field(
         filtered_field_innovation_gauss[1:][is_used]
         - previous_weight * filtered_field_innovation_gauss[:-1][is_used]
     ) / (1.0 - previous_weight)
-    # 3. Predicted field: mean over the n samples (index i) of each row (index k), with their
-    # weights in the filter, of C (earth field - δθ × earth field) + body field. C is the nominal
-    # rotation from NED to body, δθ the attitude error
+    # The predicted field is C (earth field - δθ × earth field) + body field. C rotates from NED to
+    # the nominal body axes, and δθ is the attitude error. The prediction for row k is the mean over
+    # its samples i, weighted as in the low-pass filter
     step_indices, weight = compute_low_pass_weights(
         segment, end_times_s, sample_counts, sample_interval_s, w
     )
@@ -777,7 +777,8 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     The logged velocity is low-pass filtered. The replay fuses the mean velocity between two logged
     samples. ``gate`` is the innovation gate (√S).
     """
-    # 1. Means in the segment. begin_s: time of the first sample in each mean
+    # Each row of the flow table is the mean of several samples; begin_s is the time of the first.
+    # Keep the rows whose samples are all in the segment
     begin_s = flow.index - (flow["samples"] - 1.0) * flow["interval_s"]
     flow = flow[(begin_s > segment.time_s[0]) & (flow.index <= segment.time_s[-1])]
     sample_count = flow["samples"].to_numpy()
@@ -785,11 +786,12 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     step_index, weight = compute_low_pass_weights(
         segment, flow.index.to_numpy(), sample_count, interval_s, FLOW_FILTER_NEW_SAMPLE_WEIGHT
     )
-    # 2. Rotation from NED to the axes forward and right: the first two rows
+    # Optical flow measures the velocity along the forward and right axes, so only the first two
+    # rows of the rotation to the body frame are used
     ned_to_body_rotation = segment.body_to_ned[step_index].swapaxes(2, 3)[:, :, :2]
-    # For each mean (k) of flow samples (i): weighted mean of the velocity change from the IMU since
-    # the start of the segment, in body axes. Without this velocity change, all samples of a mean
-    # measure the same velocity
+    # The samples i of a mean k measure the velocity at different times. The velocity change since
+    # the start of the segment, integrated from the IMU, is averaged in the same way and subtracted.
+    # All samples then measure the same velocity
     imu_velocity_m_s = np.einsum(
         "ki,kiab,kib->ka", weight, ned_to_body_rotation, segment.imu_velocity_change_m_s[step_index]
     )

@@ -62,8 +62,8 @@ FLOW_PROPERTY_NAME = "optical flow"
 VISION_PROPERTY_NAME = "external vision"
 REJECTION_PROPERTY_NAME = "rejections and resets"
 OUTPUT_PREDICTOR_PROPERTY_NAME = "output predictor"
-# Properties that consist of the fusion of a further aiding source by EKF2, by PX4's name of the
-# source
+# EKF2 fuses aiding sources that KF does not fuse. The fusion of each source is a property in which
+# KF and EKF2 differ. The key is PX4's name of the source
 REPLACEMENT_NAME_BY_ADDITIONAL_AID = {
     FLOW.name: FLOW_PROPERTY_NAME,
     EV_POS.name: VISION_PROPERTY_NAME,
@@ -187,7 +187,7 @@ def explain_difference_by_replacements(
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
     configurations = make_stepwise_configurations(model.inputs, settings)
-    # baseline_replay contains the track of this configuration
+    # This configuration is not replayed again, because baseline_replay is its replay
     del configurations[REJECTION_PROPERTY_NAME]
     baseline_replay = replay_with_logged_rejections(model)
     evaluated_spans = model.baseline_replay.find_evaluated_spans()
@@ -225,7 +225,8 @@ def explain_difference_by_replacements(
     tracks = compute_delayed_tracks(model, [*configurations.values()])
     for name, track in zip(configurations, tracks, strict=True):
         states_by_replacement[name] = select_states(track)
-    # The last track contains all replacements except EKF2's rejections and output predictor
+    # The last track is EKF2 without its rejections. Its difference from baseline_replay, which
+    # contains the rejections, is their effect
     longest_rejection = _find_longest_rejection(
         baseline_replay, track, state_span_s, evaluated_spans
     )
@@ -296,7 +297,8 @@ def _explain_difference_along_axis(
         )
         state = replaced_state
     position_mean_square_m2, velocity_mean_square_m2_s2 = compute_mean_squares(kf_state).tolist()
-    # ``state`` is now the state after all replacements
+    # All properties of KF are now replaced by those of EKF2. The remaining difference between
+    # ``state`` and the logged EKF2 is unexplained
     unexplained_m2, unexplained_m2_s2 = compute_mean_squares(state).tolist()
     missing_truth_reason = NO_TRUTH_OVERLAP if isinstance(flight.truth, Truth) else flight.truth
     return DifferenceExplanation(
@@ -343,7 +345,8 @@ def make_stepwise_configurations(
     # The first source is the position source
     other_aids = list_modelled_aids(inputs)[1:]
     additional_aids = [name for name in REPLACEMENT_NAME_BY_ADDITIONAL_AID if name in other_aids]
-    # 1. KF with the sample times of EKF2: all sources except the position are disabled from 0 s on
+    # The first configuration is KF with the sample times of EKF2. Like KF, it does not fuse
+    # magnetometer, optical flow or additional external vision: they are disabled from 0 s on
     configuration = FilterConfiguration(
         {**logged_settings, **kf_noises, **dict.fromkeys(aid.lever_arm, 0.0)},
         estimates_biases=False,
@@ -354,8 +357,9 @@ def make_stepwise_configurations(
         disable_time_s_by_aid=dict.fromkeys((MAG.name, *additional_aids), 0.0),
         timestamp_offset_s=kf_settings.clock_offset_s - applied_delay_s,
     )
-    # 2. For each property, the fields of FilterConfiguration that change from KF to EKF2, in the
-    # order of the replays
+    # Each entry replaces one property of KF, such as the measurement noise, by that of EKF2. It
+    # contains the new values of fields of FilterConfiguration. The entries apply one after the
+    # other
     replacements: dict[str, dict[str, Any]] = {
         TIMESTAMPS_PROPERTY_NAME: {
             "settings": {**logged_settings, **kf_noises},
@@ -380,7 +384,8 @@ def make_stepwise_configurations(
         replacements[REPLACEMENT_NAME_BY_ADDITIONAL_AID[name]] = {
             "disable_time_s_by_aid": dict.fromkeys(additional_aids[index + 1 :], 0.0)
         }
-    # 3. One configuration per replacement. The last is EKF2 with its logged decisions
+    # Each configuration keeps all earlier replacements. The last one is EKF2 with its logged
+    # rejections and resets
     configurations = {SAMPLE_TIMES_PROPERTY_NAME: configuration}
     for name, changes in replacements.items():
         configuration = replace(configuration, **changes)
@@ -415,7 +420,8 @@ def _find_longest_rejection(
     run_starts, run_ends = change_rows.reshape(-1, 2).T
     longest_index = int(np.argmax(run_ends - run_starts))
     begin_s = fusion_times_s[run_starts[longest_index]]
-    # If the longest series continues to the end of the flight, there is no next fused sample
+    # If the longest series of rejected samples continues to the end of the flight, no sample is
+    # fused after it
     end_s = fusion_times_s[min(run_ends[longest_index], len(fusion_times_s) - 1)]
     difference = subtract_states(
         fusion_horizon_track_without_gate, baseline_replay.delayed_state.loc[begin_s:end_s]

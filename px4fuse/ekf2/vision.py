@@ -233,7 +233,8 @@ class VisionFilter:
             K *= is_fused[:, None, None]
             x = x + (K @ nu[:, :, None])[:, :, 0]
             P = P - K @ HP
-            # Without GNSS, the bias is zero: the reset is to the uncorrected position
+            # EKF2 corrects vision for a bias only during GNSS fusion. Without GNSS, EKF2 resets its
+            # position to the uncorrected vision position
             position_reset_m = np.where(is_gnss_off[:, None], position_innovation_m, nu)
             position_reset_m *= is_position_reset[:, None]
             set_states(

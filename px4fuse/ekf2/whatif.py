@@ -80,14 +80,14 @@ MAX_REJECTED_SAMPLE_FRACTION = 0.35
 # EKF2 resets the height after this time (s) without height fusion (hgt_fusion_timeout_max,
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
-# Replays with different added position noise must have similar statistics, otherwise EKF2 is not
-# predictable. Maximum ratio of largest to smallest mean NIS
+# EKF2 is not predictable if the ratio of largest to smallest mean NIS exceeds this value in replays
+# with different added position noise
 MAX_NIS_RATIO_BETWEEN_REPEATED_REPLAYS = 1.10
-# Maximum difference between the rejected fractions of replays with different added position noise,
-# if EKF2 is predictable
+# EKF2 is not predictable if the rejected fractions of samples differ by more than this value
+# between replays with different added position noise
 MAX_REJECTED_FRACTION_RANGE_OF_REPLAYS = 0.03
-# Maximum ratio of largest to smallest position RMSE of replays with different added position noise,
-# if EKF2 is predictable
+# EKF2 is not predictable if the ratio of largest to smallest position RMSE exceeds this value in
+# replays with different added position noise
 MAX_RMSE_RATIO_BETWEEN_REPEATED_REPLAYS = 1.15
 
 
@@ -467,7 +467,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf2St
         spans_s,
         evaluated_updates,
         ekf2.state,
-        None,  # σ from the logged position variance
+        None,  # the reported σ is from the logged position variance
         other_aid_updates,
         headings_rad,
         changed={},

@@ -311,8 +311,9 @@ def fit_time_correlation(
     source_low_pass = low_pass if low_pass.gain_nats > 0.0 else no_low_pass
     if not is_correlated:
         return source_low_pass, no_correlation_found
-    # Both gains are relative to white noise, so their difference compares low pass and correlated
-    # noise. If the correlated noise has its own time offset, it has one parameter more
+    # Both log-likelihood gains are relative to white noise, so their difference compares a low-pass
+    # filter with time-correlated noise. A fitted time offset is one more parameter of the
+    # time-correlated noise, so a penalty is added
     fitted_parameters = correlated_noise_fit.noise_parameters
     return source_low_pass, TimeCorrelatedNoise(
         tau_s=fitted_parameters.tau_s,
@@ -351,7 +352,7 @@ def fit_time_correlation_to_truth(
             MIN_TRUTH_LIKELIHOOD_GAIN_NATS, correlated_noise_from_imu.gain_nats
         )
         low_pass_gain_nats = correlated_noise_from_imu.low_pass_gain_nats
-    # 1. Positions near a sample of ground truth, without outliers, downsampled
+    # Use positions near a sample of ground truth, without outliers, and downsample them
     true_track = pd.concat([truth["position_m"] for truth in truths], axis=1).dropna()
     measurement_time_s = np.setdiff1d(axes[0].measurement_time_s, outlier_time_s)
     measurement_time_s = measurement_time_s[
@@ -373,8 +374,8 @@ def fit_time_correlation_to_truth(
     true_m, true_velocity_m_s = (
         truth_spline(measurement_time_s + clock_offset_s, order) for order in (0, 1)
     )
-    # 2. Residuals: errors without the systematic errors, which are one constant, scale and rotation
-    # (true_m), a time offset of each flight part, and the jumps. A time offset changes the position
+    # Remove the systematic errors: a constant, scale and rotation errors (proportional to the true
+    # position), jumps, and a time offset of each flight part. A time offset changes the position
     # along each axis by offset · velocity
     is_in_flight_part = np.eye(FLIGHT_PART_COUNT)[
         FLIGHT_PART_COUNT * np.arange(position_count) // position_count
@@ -396,7 +397,7 @@ def fit_time_correlation_to_truth(
         return correlated_noise_from_imu
     white_noise_score = 0.5 * len(residuals) * np.log(np.mean(residuals**2, axis=0)).sum()
 
-    # 3. Log likelihood for each τ and each fraction f of time-correlated noise
+    # Compute the log-likelihood for each τ and each fraction f of time-correlated noise
     @cache
     def compute_scores_and_variances(tested_tau_s: float) -> ArrayPair:
         """Return -ln p and the most likely σ² for each tested fraction f.
@@ -437,7 +438,7 @@ def fit_time_correlation_to_truth(
     best_gain_nats = likelihood_gains_nats.max()
     if best_gain_nats < min_likelihood_gain_nats:
         return correlated_noise_from_imu
-    # 4. 95 % interval of τ from the profile likelihood
+    # The profile likelihood of τ gives its 95 % interval
     first_tau_index, last_tau_index = np.flatnonzero(
         likelihood_gains_nats > best_gain_nats - MAX_LOG_LIKELIHOOD_DROP
     )[[0, -1]]

@@ -170,7 +170,8 @@ class NegativeLogLikelihood:
         sigma_z_index, sigma_z_weights = _interpolate_between_nodes(
             log_sigma_z / LN_SIGMA_NODE_SPACING
         )
-        # Rows: ratios; columns: SIGMA_Z. Polynomial interpolation in both directions
+        # Interpolate -ln p by polynomials in ln(SIGMA_A / SIGMA_Z) (rows of the grid) and in ln
+        # SIGMA_Z (columns)
         scores_at_nodes = [
             self._compute_scores_at_nodes(ratio_index + node, sigma_z_index)
             for node in range(GRID_NODE_COUNT)
@@ -244,7 +245,7 @@ def negative_log_likelihood(
     measurement_weights: Array,
 ) -> float:
     """Return -ln p of the measurements of all axes, without the constant term with ln 2π."""
-    # One batch, which contains all segments. Its scores have one value: [factor 0, time offset 0]
+    # There is only one σ factor and one time offset, so element [0, 0] is the only score
     return float(
         sum(
             fit_constant_errors(
@@ -344,8 +345,8 @@ def convert_to_positions_and_increments(
     dp, dv = np.zeros((2, 1, 1, 3, measurement_count))
     dp[0, 0, 0] = preintegrated_motion.delta_position_m
     dv[0, 0, 0] = preintegrated_motion.delta_velocity_m_s
-    # The first interval starts at KF's initial state, which is fixed by its prior. Errors of the
-    # initial position and velocity therefore change the increments of this interval only
+    # The strong prior fixes the state in row 0. Errors of the initial position and velocity are
+    # therefore modelled as errors of the increments in the first interval
     dp[0, 0, 1:, 0] = (1.0, preintegrated_motion.interval_s[0])
     dv[0, 0, 2, 0] = 1.0
     return subtract_smooth_path(
@@ -387,7 +388,8 @@ def maximise_likelihood(
             positions_by_axis, start_parameters, measurement_weights, fits_outliers
         )
     # In a long flight, a fit to the first measurements gives the initial values. The positions may
-    # have one row more than the weights, KF's initial state, so the number of omitted rows is used
+    # begin with KF's initial state, which has no weight. Both arrays therefore omit the same number
+    # of rows at the end
     omitted_count = len(measurement_weights) - INITIAL_FIT_MEASUREMENT_COUNT
     first_fit = _fit_noises_and_outliers(
         [
@@ -539,8 +541,8 @@ def compute_variance_factor_of_ln_sigma_z(
     ``normalised_squares`` contains the squared error of each measurement ÷ SIGMA_Z², summed over
     its ``measured_axis_counts`` axes.
     """
-    # A measurement with the standard deviation σ (SIGMA_Z, or ratio · SIGMA_Z for an outlier) has
-    # the information 2 on ln σ for each axis. An outlier depends on ln SIGMA_Z and on ln ratio
+    # A measured axis with the standard deviation σ has the Fisher information 2 on ln σ. σ of an
+    # outlier is ratio · SIGMA_Z, so an outlier has information on both ln SIGMA_Z and ln ratio
     outlier_fraction = np.mean(outlier_probability)
     sigma_z_information = 2.0 * float(np.sum(measured_axis_counts))
     outlier_information = 2.0 * float(np.sum(measured_axis_counts * outlier_probability))
@@ -563,7 +565,8 @@ def compute_variance_factor_of_ln_sigma_z(
             np.ones_like(normalised_squares),
         ]
     )
-    # Missing information: variance of the score, because it is unknown which of both applies
+    # It is unknown if a measurement is an outlier. The variance of the score due to this is the
+    # missing information
     missing_information = (scores * (outlier_probability * (1.0 - outlier_probability))) @ scores.T
     observed_information = information_with_known_outliers - missing_information
     # With very few outliers, the information matrix may not be positive definite

@@ -337,9 +337,9 @@ def _fit_heading_errors(
 ) -> tuple[NoiseParameters, Array, Array]:
     """Fit the noises; return them, and heading error (rad) and variance (rad²) of each segment."""
     positions_and_increments = motion.make_positions_at_offset(0.0)
-    # Effect of a heading error: motion along the smooth path through the positions, rotated by 90°.
-    # This motion is the last input, the derivative with respect to the scale factor. With the noisy
-    # motion from the IMU, the estimate would be too small. Shape (axes, time offsets, inputs, ...)
+    # A small heading error adds the motion, rotated by 90°. The motion along the smooth path
+    # through the positions is used, because noise in the motion from the IMU would make the
+    # estimate too small. This path is the last input: a scale factor error adds the motion itself
     for increments in (
         positions_and_increments.delta_position_m,
         positions_and_increments.delta_velocity_m_s,
@@ -357,9 +357,9 @@ def _fit_heading_errors(
     )
     constant_errors = position_fit.estimate_constant_errors_by_segment()[:, 0]
     covariance = np.linalg.inv(position_fit.compute_constant_error_information())[:, 0]
-    # The smooth path has the scale of the measured positions, but a heading error rotates true
-    # distances: divide the fitted heading error by the ratio of true to measured distances. The
-    # last constant error, the scale factor error, is 1 minus this ratio
+    # A heading error rotates true distances, but it was fitted with the measured distances of the
+    # smooth path. It is therefore divided by the ratio of true to measured distances. The last
+    # constant error, the scale factor error, is 1 minus this ratio
     true_to_measured_scale = np.maximum(1.0 - constant_errors[:, -1], MIN_TRUE_TO_MEASURED_SCALE)
     return (
         noise_parameters,

@@ -303,7 +303,7 @@ def _find_jumps(
         return is_skipped | _is_in_window(time_s, jump_time_s, OUTLIER_BURST_DURATION_S)
 
     for _ in range(MAX_JUMPS):
-        # 1. Times to test: an outlier whose predecessor is none starts a run of outliers
+        # An outlier starts a run of outliers if the measurement before it is not an outlier
         outlier_run_starts_s = time_s[
             np.flatnonzero(is_skipped & ~np.append(False, is_skipped[:-1]))
         ]
@@ -314,8 +314,8 @@ def _find_jumps(
             *_find_significant_jump_times(design_matrix, fit, is_skipped, outlier_run_starts_s),
             *_find_significant_jump_times(design_matrix, fit, is_skipped, measurement_times_s)[:1],
         ]
-        # 2. Test of a jump at each time, with a smaller false alarm probability, because several
-        # times are tested (Bonferroni)
+        # Test a jump at each time, with a smaller false alarm probability, because several times
+        # are tested (Bonferroni)
         max_false_alarm_p = MAX_JUMP_FALSE_ALARM_P / max(len(outlier_run_starts_s), 1)
         tested_jumps = [
             _test_jump(
@@ -326,7 +326,7 @@ def _find_jumps(
         significant_jumps = [jump for jump in tested_jumps if jump]
         if not significant_jumps:
             break
-        # 3. Exact time of the most significant jump, and corrected mask of outliers
+        # Find the exact time of the most significant jump, and correct the mask of outliers
         best_jump, is_skipped = _locate_jump(
             design_matrix, is_skipped, max(significant_jumps, key=lambda jump: jump.chi_square)
         )
@@ -431,10 +431,11 @@ def _locate_jump(
         fit, _ = design_matrix.fit_with_jump(jump_time_s, is_skipped | is_near_jump)
         return fit.compute_residual_squares() > max_residual_square
 
-    # 1. Test the measurements after the jump again: in the fit without the jump, correct
-    # measurements seemed to be outliers
+    # In the fit without the jump, correct measurements after the jump seemed to be outliers. They
+    # are tested again with the jump in the fit
     is_skipped = np.where(is_after_jump, test_for_outliers(jump.time_s), is_skipped)
-    # 2. Choose the times near the jump with the largest χ², with all measurements near it
+    # Of the times near the detected jump, keep those at which a jump has the largest χ². The fit
+    # includes all measurements near the jump, because the outliers there are not known yet
     candidate_times_s = time_s[is_near_jump]
     is_skipped_away_from_jump = is_skipped & ~is_near_jump
     best_indices = np.argsort(
@@ -445,7 +446,7 @@ def _locate_jump(
             candidate_times_s,
         )
     )[:MAX_CANDIDATE_JUMP_TIMES]
-    # 3. With a jump at each of these times, test the measurements near it
+    # With a jump at each of these times, test the measurements near the jump for outliers
     masks_and_jump_times = [
         (np.where(is_near_jump, test_for_outliers(jump_time_s), is_skipped), jump_time_s)
         for jump_time_s in candidate_times_s[best_indices].tolist()
@@ -607,7 +608,6 @@ class DesignMatrix:
         jumps of the positions. ``scale`` is a trial scale factor of the positions; the acceleration
         is multiplied by it. ``is_skipped`` is True for measurements that are not used.
         """
-        # 1. Normalised innovations and design matrix
         gains = compute_gains(
             self.preintegrated_inputs, scale * self.sigma_a_m_s2, self.sigma_z_m, is_skipped
         )
@@ -615,7 +615,8 @@ class DesignMatrix:
         sum_of_log_variances = self.axis_count * float(np.sum(np.log(gains[0, ~is_skipped])))
         is_used = np.tile(~is_skipped, self.axis_count)
         used_innovations, used_columns = normalised_innovations[is_used], columns[is_used]
-        # 2. Ridge regression: the slow error has a prior, constant errors and jumps have none
+        # Ridge regression: only the coefficients of the slowly varying acceleration error have a
+        # prior. Constant errors and jumps have none
         prior_precision = np.zeros(columns.shape[1])
         prior_precision[: len(self.prior_sigma)] = self.prior_sigma**-2.0
         information = np.diag(prior_precision) + used_columns.T @ used_columns
@@ -626,8 +627,8 @@ class DesignMatrix:
         information_factor = cho_factor(information)
         covariance = cho_solve(information_factor, np.eye(len(information)))
         coefficients = covariance @ right_hand_side
-        # 3. Sum of squared residuals, and of squared coefficients over prior variances. At the
-        # minimum, with the design matrix A and data y, it is yᵀy - xᵀAᵀy
+        # The regression minimises the sum of squared residuals and of squared coefficients over
+        # prior variances. With the model y = A x, the minimum is yᵀy - xᵀAᵀy
         square_sum = float(used_innovations @ used_innovations - coefficients @ right_hand_side)
         log_determinant = 2.0 * float(np.sum(np.log(np.diag(information_factor[0]))))
         degrees_of_freedom = max(len(used_innovations) - CONSTANT_ERROR_COLUMN_COUNT, 1)
@@ -653,8 +654,9 @@ class DesignMatrix:
         """
         inputs, axis_count = self.preintegrated_inputs, self.axis_count
         axis_input_count = INPUTS_PER_AXIS * axis_count
-        # The scale factor multiplies the inputs of KF that contain measured acceleration. For each
-        # axis, these are the flight data (first input of the axis) and the effect of a yaw rotation
+        # The scale factor multiplies only quantities that contain measured acceleration. For each
+        # axis, these are the flight data (first column of the axis) and the velocity error due to a
+        # yaw error
         input_scale_factors = np.ones(inputs.measurement_m.shape[1])
         factors_by_axis = input_scale_factors[:axis_input_count].reshape(axis_count, -1)  # a view
         factors_by_axis[:, [0, 1 + FRAME_ROTATION_COLUMN]] = scale
@@ -666,13 +668,14 @@ class DesignMatrix:
             np.hstack([inputs.measurement_m, unit_steps]),
             gains,
         )
-        # Order of KF's inputs: flight data and constant errors of each axis, slow acceleration
-        # errors, jumps
+        # The columns of the responses are, in this order: flight data and constant errors of each
+        # axis, slow acceleration errors, and jumps
         axis_responses, slow_error_responses, jump_responses = np.split(
             responses, [axis_input_count, len(input_scale_factors)], axis=1
         )
-        # The rows of each axis below those of the previous one. Columns: flight data, then the
-        # constant errors, which are common to all axes
+        # All axes have the same constant errors, so their responses are stacked: the rows of each
+        # axis follow those of the previous axis. Column 0 is the flight data, the others are the
+        # constant errors
         stacked_responses = np.vstack(np.split(axis_responses, axis_count, axis=1))
         # Slow errors and jumps of an axis have no effect on the other axis
         columns = [
@@ -729,8 +732,8 @@ def make_design_matrix(
             (*integrate_between_measurements(velocity_m_s @ axis.direction, error_time_s), zeros)
             for error_time_s, velocity_m_s in velocity_errors_per_unit_bias_and_yaw
         ]
-    # The slow acceleration error is linear between knots. Its inputs are triangles: 1 m/s² at one
-    # knot, 0 at the others, sampled 20 times per interval between knots
+    # The slow acceleration error is piecewise linear. Its basis functions are triangles: 1 m/s² at
+    # one knot, 0 at the others. They are sampled 20 times per interval between knots
     slow_error_knot_interval_count = int(
         np.clip(
             np.ceil((time_s[-1] - time_s[0]) / SLOW_ERROR_KNOT_SPACING_S), 1, MAX_SLOW_ERROR_KNOTS

@@ -62,8 +62,8 @@ HEADING_SIGMA_RAD = 0.05
 # Prior σ of the constant errors of a segment: initial attitude (rad), gyro bias (rad/s) and
 # accelerometer bias (m/s²) along three axes, and position scale (1)
 PRIOR_SIGMAS_OF_CONSTANT_ERRORS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
-# Index of the heading error in the constant errors. Its index in the IMU increments is larger by 1,
-# because index 0 is the motion itself
+# Index of the heading error in the array of constant errors. In arrays of motion and its
+# derivatives with respect to these errors, the index is larger by 1, because index 0 is the motion
 HEADING_INDEX_IN_CONSTANT_ERRORS = 2
 # A gyro bias above this limit (rad/s; 5 σ of the prior) is subtracted from the gyro data before the
 # constant errors are fitted to the positions
@@ -443,7 +443,7 @@ def make_segment_motion(
     first_row, end_row = np.searchsorted(
         imu.index.to_numpy(), [imu_span_s[0] - margin_s, imu_span_s[1] + margin_s]
     )
-    # 1. Integrals of specific force and angular rate at the ends of equal steps
+    # Compute the integrals of specific force and angular rate at the ends of equal steps
     imu = imu.iloc[first_row:end_row]
     imu_time_s = imu.index.to_numpy()
     step_times_s = np.arange(imu_time_s[0], imu_time_s[-1], INTEGRATION_STEP_S)
@@ -453,8 +453,8 @@ def make_segment_motion(
         )
         for names in (Columns.SPECIFIC_FORCE, Columns.ANGULAR_RATE)
     )
-    # 2. Attitude: the gyroscopes without a large bias, integrated from the logged attitude. The
-    # first selected attitude sample is before the first step, for interpolation at this step
+    # The angular rate, without a large gyro bias, is integrated from the logged attitude. The first
+    # selected attitude sample is before the first step, for interpolation at this step
     attitude_time_s = attitude.index.to_numpy()
     first_row, end_row = np.searchsorted(attitude_time_s, step_times_s[[0, -1]], side="right")
     attitude_samples = attitude.iloc[max(first_row - 1, 0) : end_row][Columns.QUATERNION]
@@ -468,8 +468,8 @@ def make_segment_motion(
     attitude_quaternion = cumulative_product(
         np.concatenate([initial_attitude, from_rotation_vector(step_rotations_rad)])
     )
-    # 3. Acceleration and its derivatives; one row for each step. The mean specific force f of a
-    # step is rotated by the attitude in the middle of the step
+    # Compute the acceleration and its derivatives, with one row for each step. The mean specific
+    # force f of a step is rotated by the attitude in the middle of the step
     mean_specific_force_m_s2 = np.diff(specific_force_integral_m_s, axis=0) / INTEGRATION_STEP_S
     body_to_ned = to_rotation_matrix(
         multiply(attitude_quaternion[:-1], from_rotation_vector(step_rotations_rad / 2.0))
@@ -491,8 +491,8 @@ def make_segment_motion(
         ],
         axis=2,
     )
-    # 4. Integrate all ten columns twice. Shape (3, 10, steps). position and velocity are views of
-    # the result, in which the sums are written
+    # Integrate the acceleration and its nine derivatives twice, shape (3, 10, steps). np.cumsum
+    # writes into position and velocity, which are views of the returned array
     acceleration = np.ascontiguousarray(np.moveaxis(acceleration_and_derivatives, 0, -1))
     motion_and_imu_error_derivatives = np.zeros((2, *acceleration.shape))
     position, velocity = motion_and_imu_error_derivatives

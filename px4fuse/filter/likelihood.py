@@ -113,8 +113,8 @@ def integrate_acceleration(
     """
     step_s = np.diff(prediction_steps.time_s)
     zeros = np.zeros(len(step_s))
-    # The velocity change in a prediction step moves the vehicle until the end of the interval
-    # between two measurements
+    # A velocity change in a prediction step also changes the position in all later steps, until the
+    # interval ends at the next measurement
     dp, dv = propagate_state(zeros, zeros, acceleration_m_s2, step_s)
     dp, dv = propagate_state(dp, dv, zeros, prediction_steps.compute_time_to_interval_end_s())
     dp, dv = (
@@ -195,9 +195,9 @@ def compute_innovations_with_gains(
     right_hand_side[..., 1] = preintegrated_motion.delta_velocity_m_s.T
     right_hand_side[..., 1:, 0] += predicted_position_gain * measured_m[..., :-1]
     right_hand_side[..., 1:, 1] += velocity_gain[:-1] * measured_m[..., :-1]
-    # Coefficients below the unit diagonal. Indices: measurement, column (0: p, 1: v), and distance
-    # of the row below the diagonal. The unknowns are p_0, v_0, p_1, v_1, ..., so the equation of
-    # p_i is 2 rows below the column of p_(i-1), and 1 row below that of v_(i-1)
+    # LAPACK's band storage contains the coefficients below the diagonal of ones. The unknowns have
+    # the order p_0, v_0, p_1, v_1, ...: bands[i, 0] belongs to p_i, bands[i, 1] to v_i. The last
+    # index is the distance from the diagonal, in rows
     bands = np.zeros((len(position_gain), 2, 4))
     bands[:-1, 1, 1] = -dt
     bands[:-1, 0, 2] = predicted_position_gain - 1.0
@@ -295,7 +295,8 @@ def find_profile_likelihood_interval(
             drop = max(profile_fit.fun - best_score, 0.0)
             return float(np.sqrt(drop)) - max_sqrt_log_likelihood_drop
 
-        # First double the change until the decrease is too large: the end is before this change
+        # Double the change of ln σ until the log-likelihood decreases by more than its limit. The
+        # end of the interval is then between 0 and this change
         max_change = direction * (float(np.log(search_limit)) - best_log_sigmas[0])
         outer_change = min(INITIAL_LOG_SIGMA_SEARCH_STEP, max_change)
         while compute_drop_excess(outer_change) < 0.0:

@@ -216,9 +216,9 @@ class PositionFit:
         All σ are multiplied by each of ``sigma_factors``. A term that is equal for all time offsets
         is omitted.
         """
-        # Row and column 0: the data d. Other rows and columns: the constant errors e. In units of
-        # their prior σ, their information matrix is G_ee + I. Marginalised over them, -ln p of the
-        # data is ½ (G_dd - G_de (G_ee + I)⁻¹ G_ed) + ½ ln |G_ee + I|
+        # Row and column 0 of the Gram matrix G belong to the data d, the others to the constant
+        # errors e in units of their prior σ. Marginalised over e, -ln p of the data is
+        # ½ (G_dd - G_de (G_ee + I)⁻¹ G_ed) + ½ ln |G_ee + I|
         units = np.append(1.0, self.prior_sigmas_of_constant_errors)
         sigma_factors = sigma_factors[:, None, None, None, None]
         gram_matrix = self.gram_matrix / sigma_factors**2 * np.outer(units, units)
@@ -279,14 +279,14 @@ def fit_positions(
         for rows in (slice(axis, axis + 1) for axis in axes):
             measured_axis_m, increments = measured_m[rows], (dp[rows], dv[rows])
             weighted_increments = system.weight_increments(*increments)
-            # Its values are ordered by measurement, then by state: state_count values for each
-            # measurement, so the segment edges below are multiplied by it
+            # This array has state_count values for each measurement, so its segment edges are
+            # multiplied by state_count
             whitened_explained_part = system.whiten_explained_part(
                 measured_axis_m, *weighted_increments
             )
-            # Inner product of two inputs of the regression: ΔᵀQ⁻¹Δ of the IMU increments Δ, plus
-            # zᵀR⁻¹z of the positions z (below), minus the part that the estimated positions and
-            # velocities explain
+            # The inner product of two inputs is ΔᵀQ⁻¹Δ of their IMU increments, plus zᵀR⁻¹z of
+            # their positions (added below). The least-squares estimate of position and velocity
+            # explains a part of it, which is subtracted
             for sign, left, right, values_per_measurement in (
                 (1.0, increments[0], weighted_increments[0], 1),
                 (1.0, increments[1], weighted_increments[1], 1),
@@ -333,20 +333,22 @@ def subtract_smooth_path(
     measured_m = positions.measurement_m.copy()
     dp = positions.delta_position_m.copy()
     dv = positions.delta_velocity_m_s.copy()
-    # Shapes: (axes, time offsets, measurements) or (axes, time offsets, intervals)
+    # The smooth path has the shape (axes, time offsets, measurements), its increments have the
+    # shape (axes, time offsets, intervals)
     for axes, system, _ in positions.factorise_equations(
         PATH_SMOOTHER_SIGMA_A_M_S2, np.full(len(measured_m), PATH_SMOOTHER_SIGMA_Z_M**2)
     ):
         measured_m_by_axis = np.repeat(
             np.nan_to_num(measured_m[:, axes].T)[:, None], dp.shape[1], 1
         )
-        # Input 0 is the data (positions, IMU increments), the last input is the derivative for the
-        # scale factor error
+        # In dp and dv, index 0 of the third dimension is the measured increment. The last index is
+        # the derivative with respect to the scale factor error
         smoothed_state = system.solve(measured_m_by_axis, dp[axes, :, 0], dv[axes, :, 0])
         smoothed_state[:, :, positions.segment_start_indices] = 0.0
         path_m = smoothed_state[..., 0]
         path_velocity_m_s = smoothed_state[..., 1]
-        # Increments of the path, defined like those of the IMU (PositionsAndIncrements)
+        # The increments of the path are subtracted from those of the IMU, so they have the same
+        # definition: Δp does not include the motion with the velocity at the start of the interval
         path_delta_position_m = np.diff(path_m) - positions.interval_s * path_velocity_m_s[..., :-1]
         measured_m[:, axes] -= path_m[:, 0].T
         # All tested time offsets have the same measured positions, so the same path is subtracted
@@ -376,8 +378,8 @@ def estimate_squared_errors(
     constant_errors : ndarray, shape (segments, c)
         Estimated constant errors (such as biases).
     """
-    # Increments without constant errors: data + Σ constant error · derivative. The inputs (k) are
-    # the data with weight 1, and the derivatives with the constant errors as weights
+    # Correct the increments for the constant errors: measured increment + Σ constant error ·
+    # derivative. This is one weighted sum, in which the measured increment (k = 0) has the weight 1
     input_weights = np.insert(constant_errors, 0, 1.0, axis=1)
     # The interval between two measurements belongs to the segment of the later measurement
     input_weights_by_interval = np.repeat(
@@ -428,8 +430,9 @@ def compute_segment_inner_products(
     inner_products_by_batch = []
     for begin in range(0, right_factor_positions_m.shape[1], INNER_PRODUCTS_PER_BATCH):
         batch_slice = np.s_[:, begin : begin + INNER_PRODUCTS_PER_BATCH]
-        # Inputs of the regression: each u, each v with zero increments, and the derivative for each
-        # constant error with zero positions
+        # fit_positions returns the inner products of all pairs of its inputs. The inputs are here
+        # the vectors u, the vectors v (with zero increments), and the derivatives with respect to
+        # the constant errors (with zero positions)
         dp, dv = (
             np.concatenate(
                 [
@@ -448,8 +451,8 @@ def compute_segment_inner_products(
         left_and_right_factor_positions_m = np.concatenate(
             [left_factor_positions_m[batch_slice], right_factor_positions_m[batch_slice]], axis=1
         )[:, None]
-        # Inner products of all pairs of inputs, (segments, inputs, inputs). Only those of each u
-        # with its v are returned: the diagonal
+        # Of the inner products of all u with all v, only the diagonal is returned: the product of
+        # each u with the v of the same index
         gram_matrix = fit_positions(
             replace(positions, delta_position_m=dp, delta_velocity_m_s=dv),
             sigma_a_m_s2,
@@ -553,8 +556,9 @@ class BandedNormalEquations:
         right_hand_side[..., 1:, 1] = weighted_dv
         right_hand_side[..., :-1, 0] -= weighted_dp
         right_hand_side[..., :-1, 1] -= self.interval_s * weighted_dp + weighted_dv
-        # Only the first inputs of the regression have positions. The measured quantity is the
-        # position plus the time-correlated noise, if it is fitted
+        # The derivatives with respect to the constant errors contain no positions, so only the
+        # first inputs change here. A measurement is the sum of position and time-correlated noise
+        # (if it is fitted), so it adds to the rows of both states
         weighted_measurements = self.precision[:, 0] * measured_m
         right_hand_side_with_measurements = right_hand_side[..., : measured_m.shape[-2], :, :]
         right_hand_side_with_measurements[..., 0] += weighted_measurements
@@ -567,19 +571,19 @@ class BandedNormalEquations:
         The information of earlier and of later measurements is added (Fraser and Potter 1969).
         """
         # At each measurement, the Cholesky factor of A contains the information of all earlier
-        # measurements. With A in reverse time order, it contains that of all later measurements.
-        # Element (i + band, i) of A, which is column i of the band, becomes element (n - 1 - i, n -
-        # 1 - i - band)
+        # measurements. If A is reversed in time, its factor contains that of all later
+        # measurements. Reversal moves element (i + band, i) of A to (n - 1 - i, n - 1 - i - band)
         time_reversed_bands = [np.roll(row[::-1], -band) for band, row in enumerate(self.bands)]
         time_reversed_cholesky_factor, _ = lapack.dpbtrf(time_reversed_bands, lower=1)
-        # Diagonal blocks (one for each measurement) of the Cholesky factors. In time order they are
-        # [[a, 0], [b, c]] for (position, velocity). In reverse time order they are
-        # [[d, 0], [e, f]] for (velocity, position)
+        # Each measurement has a 2 × 2 diagonal block in each Cholesky factor. In the first factor
+        # it is [[a, 0], [b, c]] with the states position, velocity. In the time-reversed factor it
+        # is [[d, 0], [e, f]] with the states velocity, position
         (a, c), b = self.cholesky_factor[0].reshape(-1, 2).T, self.cholesky_factor[1, ::2]
         d, f = time_reversed_cholesky_factor[0].reshape(-1, 2)[::-1].T
         e = time_reversed_cholesky_factor[1, ::2][::-1]
-        # Sum of both information matrices LLᵀ, minus the diagonal block of A that is in both. The
-        # variance of the position is element 00 of its inverse
+        # The information of both blocks L, which is LLᵀ, is added. Both contain the block of A for
+        # this measurement, so it is subtracted once. The variance of the position is element 00 of
+        # the inverse
         p00 = a**2 + e**2 + f**2 - self.bands[0, 0::2]
         p01 = a * b + d * e - self.bands[1, 0::2]
         p11 = b**2 + c**2 + d**2 - self.bands[0, 1::2]
@@ -636,7 +640,8 @@ def factorise(
         np.stack([q11, -q01, q00 + regularisation_variance_m2]) / q_determinant,
         0.0,
     )
-    # Elements of Q⁻¹, and the element of FᵀQ⁻¹ in the row of velocity and the column of position
+    # With the transition matrix F = [[1, dt], [0, 1]], position_velocity_weight is the element of
+    # FᵀQ⁻¹ in the row of velocity and the column of position
     inverse_q00, inverse_q01, inverse_q11 = inverse_q
     position_velocity_weight = inverse_q00 * interval_s + inverse_q01
     # A = diag(precision) + Σ [-F I]ᵀ Q⁻¹ [-F I] over the intervals. An interval adds the 2 × 2
@@ -651,15 +656,15 @@ def factorise(
     position_bands = band_storage[:, 0]
     velocity_bands = band_storage[:, 1]
     position_bands[:, 0], velocity_bands[:, 0] = measurement_and_prior_precision.T
-    # Q⁻¹ at the end of each interval
+    # Add Q⁻¹ to the block of the states at the end of each interval
     position_bands[1:, 0] += inverse_q00
     position_bands[1:, 1] = inverse_q01
     velocity_bands[1:, 0] += inverse_q11
-    # FᵀQ⁻¹F at its start
+    # Add FᵀQ⁻¹F to the block of the states at the start of each interval
     position_bands[:-1, 0] += inverse_q00
     position_bands[:-1, 1] += position_velocity_weight
     velocity_bands[:-1, 0] += (position_velocity_weight + inverse_q01) * interval_s + inverse_q11
-    # -Q⁻¹F below
+    # Set the block between both, below the diagonal, to -Q⁻¹F
     position_bands[:-1, state_count] = -inverse_q00
     position_bands[:-1, state_count + 1] = -inverse_q01
     velocity_bands[:-1, state_count - 1] = -position_velocity_weight
@@ -670,8 +675,8 @@ def factorise(
         rho = np.where(is_within_segment, np.exp(-interval_s / tau_s), 0.0)
         # Gauss-Markov process: variance σ_c² at the start of a segment, driving noise (1 - ρ²) σ_c²
         correlated_noise_step_variance_m2 = correlated_sigma_m**2 * np.append(1.0, 1.0 - rho**2)
-        # A measurement contains position + correlated noise, so its precision is in both diagonal
-        # elements and in the element between them
+        # A measurement is the sum of position and correlated noise. Its precision is therefore in
+        # the diagonal elements of both states, and in the off-diagonal element that couples them
         correlated_noise_bands = band_storage[:, 2]
         position_bands[:, 2] = position_measurement_precision
         correlated_noise_bands[:, 0] = (

@@ -342,9 +342,9 @@ def integrate_ned_acceleration(
         )
     is_gap = find_imu_gaps(time_s)
     gap_rows = np.flatnonzero(is_gap)
-    # KF needs the time in gaps during each of its steps: the difference of the total gap time at
-    # both ends of the step. This total is linear between the edges of gaps, so only these are kept.
-    # The second moments give the acceleration variance in gaps, where the acceleration is unknown
+    # KF needs the time without IMU data in each step: the increase of the cumulative gap time from
+    # start to end of the step. This time is linear between gap edges, so only its values at the
+    # edges are stored. In gaps, the second moments give the variance of the unknown acceleration
     cumulative_gap_s = np.cumsum(np.where(is_gap, np.diff(time_s), 0.0))
     gap_edge_rows = np.unique([0, *gap_rows, *(gap_rows + 1), len(time_s) - 1])
     return Acceleration(

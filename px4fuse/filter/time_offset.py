@@ -309,8 +309,8 @@ def _compute_offset_likelihood_curve(
     """
     while True:
         offsets_s = _make_offset_grid(offset_s, half_width_s, LIKELIHOOD_CURVE_POINT_COUNT)
-        # Test other time offsets if the curve extends beyond the tested ones, or if their steps are
-        # too large for an interpolation of -ln p
+        # -ln p is interpolated between tested time offsets. New offsets are tested if the curve
+        # extends beyond the tested ones, or if their spacing is too large for an interpolation
         if (
             offsets_s[0] < tested_offsets_s[0]
             or offsets_s[-1] > tested_offsets_s[-1]
@@ -351,7 +351,7 @@ def _simulate_variance_increase_by_imu_noise(
     residuals and velocity noise is the error of the score. Its variance is computed for groups of
     flight segments and added over the groups.
     """
-    # 1. Draw noise: noise_series_count independent series for each axis and measurement or interval
+    # Draw noise: noise_series_count independent series for each axis and measurement or interval
     positions_at_offset = imu_motion.make_positions_at_offset(offset_s)
     is_within_segment = positions_at_offset.is_within_segment
     measurement_count = len(imu_motion.time_s)
@@ -384,9 +384,9 @@ def _simulate_variance_increase_by_imu_noise(
     velocity_noise = np.zeros_like(error_m)
     for begin, end in pairwise(imu_motion.segment_edges.tolist()):
         np.cumsum(dv[..., begin : end - 1], axis=-1, out=velocity_noise[..., begin + 1 : end])
-    # 2. Inner product of residuals (error_m, dp, dv) and velocity noise, for each segment and
-    # series. Its variance over the series, summed over groups of segments, is the additional
-    # variance of the score
+    # The error of the score is the inner product of the simulated residuals (error_m, dp, dv) and
+    # the velocity noise. It is computed for each segment and each noise series. Its variance over
+    # the series, summed over groups of segments, increases the variance of the score
     positions_at_offset, measurement_variance_m2 = add_noises(
         positions_at_offset, noise_parameters, imu_motion.measurement_weights
     )
@@ -452,9 +452,9 @@ def _estimate_flight_part_offsets(
             score_excesses.append(scores - scores.min())
     if len(part_offsets) < 2:
         return tuple(part_offsets), None
-    # Log-likelihood ratio: one common time offset against separate time offsets of the flight
-    # parts. The score excesses (nats) do not contain the effect of IMU noise: divide by its
-    # variance factor
+    # Likelihood-ratio test of one common time offset against a separate time offset of each
+    # segment. score_excesses contains -ln p minus its minimum in each segment. IMU noise increases
+    # the variance of the offsets, so χ² is divided by the variance factor
     chi_square = 2.0 * float(np.sum(score_excesses, axis=0).min()) / offset_variance_factor
     return tuple(part_offsets), float(chdtrc(len(part_offsets) - 1, chi_square))
 
