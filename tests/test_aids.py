@@ -74,7 +74,7 @@ def evaluate(log: AidLog, name: str = "gnss_pos") -> AidResult:
     (0.5, "consistent"), (0.58, "consistent"), (0.68, "overconfident"),
     (0.43, "consistent"), (0.37, "underconfident"),
 ])  # fmt: skip
-def test_aiding_source_is_consistent_at_root_nis_of_0_8_to_1_25(sigma, verdict) -> None:
+def test_sensor_with_root_mean_nis_of_0_8_to_1_25_is_consistent(sigma, verdict) -> None:
     aid = evaluate(aid_log(sigma=sigma))
     assert aid.verdict == verdict
     assert aid.nis_mean == pytest.approx((sigma / 0.5) ** 2, rel=0.06)
@@ -160,7 +160,7 @@ def test_aiding_source_report_names_its_noise_parameter(
     assert evaluate(aid_log(own=False, **parameters), name).noise_from == ""
 
 
-def test_not_fused_verdict_needs_longer_gap_at_low_log_rate() -> None:
+def test_aiding_source_logged_rarely_is_unfused_after_longer_gap() -> None:
     """Rows of zeros are samples that EKF2 logged between two measurements."""
     log = aid_log(own=False, enabled=steps((0.0, 1.0)))
     decimated = replace(log, samples=log.samples.iloc[::10])
@@ -281,9 +281,7 @@ def test_innovation_sign_is_the_same_for_each_px4_release(generation, tmp_path):
 # ---------------------------------------------------------------------------- reporting
 
 
-def test_compare_with_checks_option_exits_with_1_on_sensor_fault(
-    tmp_path, monkeypatch, capsys
-) -> None:
+def test_compare_option_checks_exits_with_1_on_sensor_fault(tmp_path, monkeypatch, capsys) -> None:
     log, report = gnss_log("v1.16").write(tmp_path / "a.ulg"), tmp_path / "a.pdf"
     code, _, err = run_main(monkeypatch, capsys, "compare", log, "--checks", "-o", report)
     bad = [each.label for each in evaluate_aids(read_log(log)).values() if each.is_faulty]
@@ -292,7 +290,7 @@ def test_compare_with_checks_option_exits_with_1_on_sensor_fault(
 
 
 @pytest.mark.parametrize(("sigma", "bad"), [(0.5, False), (0.25, False), (1.5, True)])
-def test_checks_option_accepts_underconfident_aiding_source(sigma: float, bad: bool) -> None:
+def test_underconfident_aiding_source_is_not_a_failed_check(sigma: float, bad: bool) -> None:
     made = with_aids(gnss_pos=aid_log(sigma=sigma))
     alone = AidingSourceAnalysis(
         made, evaluate_aids(made), Unavailable("it", "not there", "Log it.")

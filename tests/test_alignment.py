@@ -240,7 +240,7 @@ def test_align_position_file_takes_frame_from_column_names(flight: Flight, frame
     )
 
 
-def test_align_position_file_on_diagonal_path_requires_frame() -> None:
+def test_frame_of_position_file_on_45_degree_path_must_be_given() -> None:
     flight = flight_along(partial(passes, across_m=0.0), heading_deg=45.0)
     file = uwb_file(flight, frame="enu")
     file.samples["z_m"] = np.nan
@@ -528,7 +528,7 @@ def test_align_position_file_of_sitl_log_recovers_clock_offset(
 
 
 @pytest.mark.slow
-def test_position_file_aligned_to_late_ekf2_is_realigned_to_imu():
+def test_file_alignment_to_delayed_ekf2_is_corrected_by_imu():
     faults = parse_faults(["clock-offset=-0.25", "ekf2-delay=0.001"])
     late = simulate_flight(Scenario(seed=3, passes=4), faults)
     truth = late.truth.samples[Columns.POSITION]

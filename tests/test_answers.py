@@ -92,7 +92,7 @@ def test_read_answer_form_returns_filled_in_values(tmp_path: Path) -> None:
         (EMPTY.replace("ekf2_did = []", 'ekf2_did = ["slept"]'), "'slept' is not one of"),
     ],
 )  # fmt: skip
-def test_read_invalid_answer_form_names_line_in_one_line_error(
+def test_read_invalid_answer_form_raises_one_line_error(
     tmp_path: Path, text: str, said: str
 ) -> None:
     with pytest.raises(SettingsError) as error:
@@ -119,7 +119,7 @@ def test_answer_form_questions_differ_for_each_log() -> None:
         assert found == pytest.approx(by_hand.get(quantity.kind, found), rel=1e-9)
 
 
-def test_answer_form_solution_of_predicted_sigma_is_closed_form() -> None:
+def test_correct_answer_on_predicted_sigma_equals_closed_form() -> None:
     """Closed form: P grows by F P Fᵀ + Q in each step of DT."""
     main = compare(aisle_flight(duration_s=60.0)).main
     quantity = next(

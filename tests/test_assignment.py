@@ -93,7 +93,7 @@ class TestDraw:
             SECRET, "s1", "aisle"
         )
 
-    def test_flight_drawn_from_known_secret_seed_has_pinned_scenario(self):
+    def test_flight_drawn_from_fixed_seed_has_reference_parameters(self):
         drawn = assign_random_flight(SECRET, "s1", "aisle", 2)
         scenario = drawn.scenario
         # a loop contains no ground truth, which would show the landing
@@ -129,7 +129,7 @@ class TestDraw:
         names = {choice.name for one in flights for choice in choices_of(one)}
         assert names == {choice.name for choice in ASSIGNABLE_FAULTS if choice.flight_kind == kind}
 
-    def test_assignment_of_kind_mixed_has_aisle_and_loop_flights(self):
+    def test_mixed_assignments_have_set_fraction_of_loop_flights(self):
         mixed = [assign_random_flight(SECRET, f"s{n}", "mixed") for n in range(1000)]
         kinds = Counter(one.scenario.kind for one in mixed)
         assert kinds["loop"] / 1000 == pytest.approx(LOOP_FLIGHT_PROBABILITY, abs=0.05)

@@ -307,7 +307,7 @@ def test_grade_report_with_forged_results_is_not_verified(
     assert graded.points <= honest.points + 1e-9
 
 
-def test_report_with_changed_page_keeps_points_for_its_numbers(
+def test_report_with_altered_page_earns_points_for_its_results(
     flight: Flight, honest: GradedReport, rubric: Rubric
 ) -> None:
     """The numbers are verified and the page is not; the redrawn report is scored."""
@@ -368,7 +368,7 @@ LOOPS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], float, int]] = {
 
 
 @pytest.mark.parametrize("name", LOOPS)
-def test_loop_report_points_require_the_right_loop_closure(name: str) -> None:
+def test_loop_report_earns_points_only_for_right_loop_closure(name: str) -> None:
     truth, request, loop, points, flags = LOOPS[name]
     graded = grade_loop(truth, request, loop)
     assert graded.points == pytest.approx(points), graded.items

@@ -115,7 +115,7 @@ def test_setting_without_improvement_in_rerun_is_not_recommended() -> None:
     assert rank_causes(analysis(trial("time offset", FLOWN), fails), [OFFSET]) == []
 
 
-def test_advised_clock_offset_includes_applied_file_clock_offset() -> None:
+def test_advised_clock_offset_is_applied_offset_plus_correction() -> None:
     flight = analysis(trial("time offset", CORRECTED))
     flight.source.alignment = SimpleNamespace(clock_offset_s=-1795287249.945)
     (ranked,) = rank_causes(flight, [OFFSET])
@@ -216,7 +216,7 @@ def test_diagnosis_omits_actions_that_advise_no_change() -> None:
     assert _format_actions((cause,), ()) == ("Sender: remove outliers before sending.",)
 
 
-def test_text_on_kf_sigma_z_names_its_default_ekf2_gps_p_noise() -> None:
+def test_kf_measurement_noise_text_names_px4_default_parameter() -> None:
     gnss = findings_tools.analysis(source=findings_tools.source(origin=GNSS_ORIGIN))
     _, changed = _describe_kf_settings(gnss, ComparisonRequest(log="a.ulg", sigma_z_m=0.1))
     assert changed == ("--sigma-z 0.1 (default from EKF2_GPS_P_NOISE)",)
@@ -226,7 +226,7 @@ def test_text_on_kf_sigma_z_names_its_default_ekf2_gps_p_noise() -> None:
     ("remedy", "target"),
     [("Check EKF2_EV_DELAY.", "EKF2"), ("Correct the timestamps at the sender.", "sender")],
 )
-def test_action_that_names_ekf2_ev_delay_is_assigned_to_ekf2(remedy: str, target: str) -> None:
+def test_advice_that_names_ekf2_ev_delay_is_assigned_to_ekf2(remedy: str, target: str) -> None:
     delay = findings_tools.made(Finding, id="ekf2_ev_delay_wrong", remedy=remedy)
     assert _find_action_target(delay) == target
 

@@ -44,7 +44,7 @@ def test_diagnosis_html_shows_causes_actions_reruns_and_notes() -> None:
     assert make_card_html(SMALL_SIGMA_A, has_apply_buttons=True).count("data-apply") == 1
 
 
-def test_sigma_ratio_html_plot_shows_ratio_and_interval() -> None:
+def test_html_plot_of_error_to_sigma_ratio_shows_its_interval() -> None:
     four = list(verdicts((21.0, "overconfident"), (0.9, "consistent"), (0.05, "underconfident"),
                          (None, "not evaluated")))  # fmt: skip
     four[1] = structs.replace(four[1], interval=(0.8, 1.2))
@@ -68,7 +68,7 @@ def test_sigma_ratio_html_plot_shows_ratio_and_interval() -> None:
     ]
 
 
-def test_diagnosis_html_verdict_with_known_cause_is_not_bold() -> None:
+def test_diagnosis_html_of_explained_inconsistency_is_not_bold() -> None:
     one = structs.replace(verdicts(*[(2.2, "overconfident")] * 4)[2], is_explained=True)
     html = make_sigma_ratio_html([one], "along the aisle")
     assert "loud" not in html
@@ -101,7 +101,7 @@ def test_diagnosis_html_escapes_text_from_logs() -> None:
     assert {tag for tag, _ in Elements(html).found} <= allowed
 
 
-def test_diagnosis_of_rejected_log_has_no_sigma_ratio_plot() -> None:
+def test_diagnosis_html_of_rejected_log_has_no_plot() -> None:
     card = DiagnosisCard(
         severity="refused",
         id="not_px4",

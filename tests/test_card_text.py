@@ -24,12 +24,12 @@ def text_of(card: DiagnosisCard) -> list[str]:
     ("ratio", "column", "mark"),
     [(1.0, 21, "●"), (0.1, 5, "●"), (10.0, 37, "●"), (0.01, 5, "◀"), (128.0, 37, "▶")],
 )
-def test_sigma_ratio_text_plot_has_marker_at_column_of_ratio(ratio, column, mark) -> None:
+def test_text_plot_marks_error_to_sigma_ratio_on_log_scale(ratio, column, mark) -> None:
     drawn = draw_sigma_ratio(ratio, "source")
     assert (len(drawn), drawn.index(mark)) == (41, column)
 
 
-def test_text_plot_of_missing_sigma_ratio_shows_consistent_range() -> None:
+def test_text_plot_without_ratio_still_shows_consistent_range() -> None:
     assert re.fullmatch("1/10 ─{14}░{5}─{14} 10", draw_sigma_ratio(None, "source"))
     assert re.fullmatch("1/10 ─{13}░{7}─{13} 10", draw_sigma_ratio(None, "truth"))
 
@@ -44,7 +44,7 @@ def test_diagnosis_text_has_at_most_40_lines() -> None:
         assert part in whole
 
 
-def test_diagnosis_text_below_98_columns_omits_sigma_ratio_plot() -> None:
+def test_diagnosis_on_terminal_below_98_columns_omits_text_plots() -> None:
     card = replace(SMALL_SIGMA_A, causes=())
     wide, narrow = (
         [text for line in card_text.format_card_lines(card) for text in line.wrap(width)]
@@ -58,7 +58,7 @@ def test_diagnosis_text_below_98_columns_omits_sigma_ratio_plot() -> None:
     assert ratio_lines == [text for text in narrow if text in ratio_lines]
 
 
-def test_diagnosis_text_numbers_alternative_actions() -> None:
+def test_alternative_actions_are_numbered_in_diagnosis_text() -> None:
     cause = replace(SMALL_SIGMA_A.causes[0], alternatives=((SENDER,), (DELAY,)))
     card = replace(SMALL_SIGMA_A, causes=(cause,))
     lines = text_of(card)

@@ -88,13 +88,13 @@ def test_fault_report_lists_consequences_after_their_cause(given: Any, told: Any
     assert [(each.id, each.severity, each.caused_by) for each in group_by_cause(given)] == told
 
 
-def test_consistency_notes_list_innovations_that_are_correlated(sample: Analysis) -> None:
+def test_consistency_verdict_warns_of_correlated_innovations(sample: Analysis) -> None:
     (white,) = list_verdict_warnings(sample)
     assert "Ljung-Box test, p < 0.001" in white
     assert "KF along down, lag-1 autocorrelation" in white
 
 
-def test_each_report_page_on_mean_nis_defines_consistent_filter(sample: Analysis) -> None:
+def test_report_pages_with_mean_nis_state_its_consistent_range(sample: Analysis) -> None:
     pages = [Page(), *consistency.draw_pages(sample, None)]
     terminal._write_details(pages[0], sample, SimpleNamespace(findings=()))
     assert all(
@@ -102,7 +102,7 @@ def test_each_report_page_on_mean_nis_defines_consistent_filter(sample: Analysis
     )
 
 
-def test_consistency_notes_of_white_innovations_are_empty(sample: Analysis) -> None:
+def test_consistency_verdict_of_white_innovations_has_no_warning(sample: Analysis) -> None:
     east = sample.axes["east"]
     fine = replace(east.filters["kf"], ljung_box_p=0.5)
     white = replace(east, filters={**east.filters, "kf": fine})

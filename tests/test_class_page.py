@@ -275,7 +275,7 @@ def test_grades_page_click_on_row_opens_report_details(page: Browser) -> None:
     assert page.requests() <= {"file", "data"}
 
 
-def test_grades_page_links_report_recomputed_from_the_log() -> None:
+def test_grades_page_has_link_to_report_recomputed_from_log() -> None:
     one = row(
         "Zoë", 18.5, redrawn_report_path="reports/1.pdf", pages=(PageDifference(1, "a word"),)
     )

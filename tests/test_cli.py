@@ -73,7 +73,7 @@ def test_report_prints_special_characters_in_name_and_notes(report):
 
 @pytest.mark.usefixtures("no_drawing")
 @pytest.mark.parametrize(("severity", "code"), [("note", 1), ("warning", 1), ("error", 0)])
-def test_compare_fail_on_option_sets_exit_code(tmp_path, sample_log, severity, code):
+def test_compare_option_fail_on_sets_exit_code_by_severity(tmp_path, sample_log, severity, code):
     command = "compare", sample_log, "-o", tmp_path / "a.pdf", "--fail-on", severity
     run_checked(*command, "--sigma-z", "0.12", code=code)  # the finding is a warning
     run_checked(*command, code=0)  # the flight has no finding

@@ -113,7 +113,7 @@ def level_signals(
     return make_segment_motion(imu, attitude_table(time, spoiled), (0.5, 19.0))
 
 
-def test_velocity_per_imu_error_at_rest_equals_closed_form() -> None:
+def test_velocity_sensitivity_to_imu_errors_equals_closed_form() -> None:
     signals = level_signals()
     t, g = signals.time_s - signals.time_s[0], GRAVITY[2]
     motion = np.moveaxis(signals.motion_and_imu_error_derivatives, -1, 0)
@@ -546,7 +546,7 @@ def test_time_offset_interval_widens_if_flight_parts_differ() -> None:
     assert found.is_determinable
 
 
-def test_time_offset_interval_is_kept_if_flight_parts_agree() -> None:
+def test_time_offset_interval_does_not_widen_if_parts_agree() -> None:
     found = widen_for_scatter(stated(0.01, -0.01, 0.015, -0.02, 0.0), "the positions drift")
     assert (found.interval_s, found.sigma_s) == (pytest.approx((-0.021, 0.019)), 0.01)
 

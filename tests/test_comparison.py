@@ -141,7 +141,7 @@ def test_compare_with_source_kind_vio_assumes_position_drift(sample_flight: Flig
 
 class TestSimulatedFlight:
     @pytest.mark.parametrize("nis", [0.01, 1.0, 20.0])
-    def test_ekf2_sigma_ratio_is_root_of_simulated_mean_nis(self, nis: float) -> None:
+    def test_ekf2_error_to_sigma_ratio_is_root_of_simulated_mean_nis(self, nis: float) -> None:
         comparison = compare(aisle_flight(ekf2=Estimator(nis=nis)))
         assert comparison.horizontal.get("ekf2").sigma_ratio == pytest.approx(nis**0.5, rel=0.05)
 
@@ -180,7 +180,9 @@ class TestSimulatedFlight:
         assert other == pytest.approx(one, rel=0.1)
 
     @pytest.mark.parametrize(("heading", "name"), [(0.0, "north"), (90.0, "east")])
-    def test_axis_at_heading_0_or_90_equals_north_or_east(self, made, heading, name) -> None:
+    def test_analysis_along_heading_0_or_90_deg_equals_north_or_east(
+        self, made, heading, name
+    ) -> None:
         aisle = compare(made.flight, axes=("aisle",), heading_deg=heading).main
         same = made[name]
         assert asdict(aisle.difference) == pytest.approx(asdict(same.difference))

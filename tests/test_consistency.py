@@ -52,7 +52,7 @@ def test_white_innovations_have_verdict_consistent() -> None:
 
 
 @pytest.mark.parametrize("factor", [0.05, 0.5, 2.0, 90.0])
-def test_sigma_ratio_scales_as_1_over_root_innovation_variance(factor: float) -> None:
+def test_root_mean_nis_scales_as_1_over_root_innovation_variance(factor: float) -> None:
     variance = np.random.default_rng(2).uniform(0.5, 2.0, 2000)
     result = assessed(white(1, 2000) * np.sqrt(variance), factor * variance)
     assert result.sigma_ratio == pytest.approx(factor**-0.5, rel=0.04)

@@ -154,7 +154,7 @@ def test_frame_detection_finds_yaw_rotation_of_positions(rotation_deg):
     assert (total - rotation_deg + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=4.0)
 
 
-def test_vision_rotation_refers_to_gnss_if_ekf2_heading_is_wrong():
+def test_vision_rotation_is_relative_to_gnss_at_wrong_ekf2_yaw():
     attitude = flown().attitude.copy()
     attitude[Columns.QUATERNION] = multiply(yaw(-14.0), attitude[Columns.QUATERNION].to_numpy())
     gnss = replace(sent(flown(), late_s=0.2, sigma_m=0.3, seed=2), origin=GNSS_ORIGIN)
@@ -313,7 +313,7 @@ def test_positions_in_correct_ned_frame_give_no_frame_fault():
     assert not list(source_convention.detect(compared(sent(flown()))))
 
 
-def test_enu_orientation_report_contains_conversion_to_ned():
+def test_report_on_enu_orientation_contains_conversion_to_ned():
     time, attitude = oriented(flown())
     quaternion = multiply(multiply(np.array(NED_TO["ENU"]), attitude), np.array(NED_TO["NWU"]))
     (found,) = source_convention.detect(
@@ -369,7 +369,7 @@ def test_late_timestamps_report_states_maximum_likelihood_delay(estimate_s, repo
 @pytest.mark.parametrize(
     ("late_s", "expected"), [(0.003, "correct"), (-0.3, "0.30 s early"), (0.3, "0.30 s late")]
 )
-def test_clock_drift_report_states_if_timestamps_are_late(late_s: float, expected: str) -> None:
+def test_report_on_clock_drift_states_if_timestamps_are_late(late_s: float, expected: str) -> None:
     drifting = Convention(verdict="determined", late_s=late_s, clock_drift=0.02)
     comparison = replace(compared(sent(flown())), convention=drifting)
     (found,) = source_convention.detect(comparison)
@@ -401,7 +401,7 @@ def test_compare_note_on_automatic_clock_offset_states_its_value():
     assert applied_s == pytest.approx(prepared.settings.clock_offset_s, abs=0.001)
 
 
-def test_ambiguous_position_axes_report_lists_possible_axes():
+def test_report_on_ambiguous_position_axes_lists_possible_axes():
     (found,) = source_convention.detect(replace(compared(sent(flown())), convention=AMBIGUOUS))
     assert found.id == "source_convention_ambiguous"
     assert "rotated by +12°" in found.message
@@ -413,7 +413,7 @@ def test_ambiguous_position_axes_report_lists_possible_axes():
     (("west", "north", "down"), "NWU positions read as ENU: x is north, y west, z up",
      "frame nwu."),
 ])  # fmt: skip
-def test_position_file_in_wrong_frame_report_names_true_frame(axes, message, remedy):
+def test_report_on_wrong_position_file_frame_names_true_frame(axes, message, remedy):
     """The axes are those of positions that were converted from ENU."""
     alignment = replace(given_placement(), frame="enu")
     (found,) = source_convention.detect(compared(replace(sent(flown(), axes), alignment=alignment)))

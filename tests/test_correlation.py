@@ -35,5 +35,5 @@ def test_autocovariance_equals_sum_of_products() -> None:
     np.testing.assert_allclose(autocovariance(v), expected, atol=1e-12)
 
 
-def test_second_best_time_offset_residual_limit_is_f_quantile() -> None:
+def test_time_offset_ambiguity_threshold_equals_f_quantile() -> None:
     assert pytest.approx(0.05, abs=0.005) == f.sf(MIN_SECOND_BEST_RESIDUAL_RATIO**2, 80, 80)

@@ -88,7 +88,7 @@ def test_report_cover_prints_texts_of_the_diagnosis() -> None:
     assert [each for each in expected if each not in text] == []
 
 
-def test_report_cover_numbers_alternative_actions() -> None:
+def test_alternative_actions_are_numbered_on_report_cover() -> None:
     sender = Action("sender", "subtract 0.264 s")
     console = Action("EKF2", commands=("param set EKF2_EV_DELAY 264", "reboot"), where="console")
     cause = DiagnosedCause(
@@ -122,7 +122,7 @@ def test_report_cover_leaves_no_space_for_empty_text(field: str, empty: Any) -> 
     assert heights[1] > heights[0] + 8.0
 
 
-def test_report_cover_verdict_with_known_cause_is_not_bold() -> None:
+def test_explained_inconsistency_on_report_cover_is_not_bold() -> None:
     card = replace(
         SMALL_SIGMA_A,
         verdicts=tuple(replace(each, is_explained=True) for each in SMALL_SIGMA_A.verdicts[:2]),
@@ -132,7 +132,7 @@ def test_report_cover_verdict_with_known_cause_is_not_bold() -> None:
     assert all(row["quiet"] and not row["loud"] for row in block["rows"])
 
 
-def test_sigma_ratio_beyond_plot_scale_is_drawn_as_triangle() -> None:
+def test_error_to_sigma_ratio_beyond_plot_scale_is_a_triangle() -> None:
     ratios = verdicts(
         (0.05, "underconfident"), (0.1, "underconfident"), (10.0, "overconfident"),
         (35.0, "overconfident"),
@@ -205,7 +205,7 @@ def test_report_cover_omits_plots_of_missing_data(changes, titles) -> None:
     assert len(set_by_typst(page)) == 1
 
 
-def test_cover_map_title_states_farthest_distance_outside_map() -> None:
+def test_cover_map_title_states_distance_of_ekf2_outside_map() -> None:
     flight = aisle_flight(duration_s=60.0)
     flight.ekf2.state.loc[30.0:31.0, "east_m"] += 40.0
     analysis = unexplained(compare(flight))

@@ -41,7 +41,7 @@ def test_simulated_fault_is_reported_first_on_95_percent_of_logs(finding) -> Non
     assert rows["rate" if finding in CONSEQUENCES else "first"].max() >= 0.95
 
 
-def test_detection_rate_of_undetectable_faults_is_at_most_0_1() -> None:
+def test_faults_listed_as_undetectable_are_rarely_reported() -> None:
     for finding, condition in NOT_DETECTABLE:
         (row,) = TABLE[
             (TABLE["finding"] == finding) & (TABLE["condition"] == condition)
@@ -68,7 +68,7 @@ def test_faults_with_detection_rate_1_are_found_in_new_flights() -> None:
         assert condition.finding in found(20_000, condition)
 
 
-def test_rate_table_has_rates_of_all_findings_and_top_findings() -> None:
+def test_rates_of_reported_and_first_reported_faults_are_counted() -> None:
     usual, yaw = clean(DEFAULT), Condition("source_frame_misaligned", "--mistake yaw=30")
     flown = [Job(0, (usual,)), Job(1, (usual,)), Job(FAULTY_SEED, (yaw,))]
     made = pd.DataFrame(

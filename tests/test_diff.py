@@ -193,7 +193,7 @@ def aid_axis(nis_mean: float) -> AidAxisStatistics:
     )  # fmt: skip
 
 
-def test_diff_excludes_aiding_source_used_as_position_source(clean):
+def test_diff_does_not_list_position_source_as_aiding_source(clean):
     axes = aid_axis(1.2), aid_axis(0.9)
     judged = {"gnss_vel": aid(*axes, rejected_fraction=0.1), "ev_pos": aid(*axes)}
     found = collect_compared_numbers(structs.replace(clean.results, aids=judged))

@@ -120,7 +120,7 @@ def test_diff_of_file_with_itself_or_without_results_is_rejected(settings, tmp_p
         assert said in error_line("diff", a, b, "--json", "-")
 
 
-def test_diff_of_logs_without_main_axis_prints_the_first_axis(settings):
+def test_diff_without_axis_of_largest_motion_prints_first_axis(settings):
     found = px4fuse.diff(*settings)
     numbers = [replace(one, path=one.path.replace("aisle", "north")) for one in found.numbers]
     numbers.append(replace(numbers[0], path="log.duration_s", label="Duration"))

@@ -43,7 +43,7 @@ def test_metres_per_degree_use_curvature_radii_of_ekf2(latitude_deg: float) -> N
     assert np.subtract(higher, (north, east, down)) == pytest.approx([1e-4, 1e-4, 0.0], abs=1e-12)
 
 
-def test_ekf2_internal_position_scale_without_gnss_origin_is_1() -> None:
+def test_ekf2_position_scale_factor_is_1_without_gnss_origin() -> None:
     assert compute_internal_to_published_position_ratio(record(45.0, north_m=3.0)) == 1.0
     assert compute_internal_to_published_position_ratio(record(np.nan)) == 1.0
 
@@ -57,7 +57,7 @@ def test_earth_rotation_rate_matches_sidereal_day() -> None:
     np.testing.assert_array_equal(compute_earth_rate_rad_s(record(np.nan)), np.zeros(3))
 
 
-def test_ekf2_model_of_gnss_flight_includes_earth_rotation() -> None:
+def test_ekf2_replay_of_gnss_flight_includes_earth_rotation() -> None:
     """The model uses EKF2's metres, the output those of the track; simulations are flat."""
     flight = simulate_flight(make_scenario("outdoor", seed=3), parse_faults(()))
     assert SIMULATED_EKF2_NOTE in flight.log.notes

@@ -123,7 +123,7 @@ def test_ekf2_replay_agrees_with_log_if_differences_are_small(
     (agreeing(0.949), False), (agreeing(s=1.051), False), (agreeing(published_m=0.29), True),
     (agreeing(published_m=0.31), False),
 ])  # fmt: skip
-def test_ekf2_replay_with_logged_rejections_decides_on_agreement(axis, good):
+def test_replay_with_logged_rejections_decides_agreement_verdict(axis, good):
     """The replay with logged rejections overrides the other verdict, good or bad."""
     own_gate = ReplayAgreement(
         north=agreeing(0.5), east=agreeing(0.5), ev_pos={}, samples=50,
@@ -150,7 +150,7 @@ def test_ekf2_replay_with_logged_rejections_decides_on_agreement(axis, good):
     assert "rejected 51% of the positions and relied on the IMU" in refused.reason
 
 
-def test_ekf2_replay_minus_log_statistics_equal_closed_form():
+def test_differences_of_ekf2_replay_from_log_equal_closed_form():
     s_log = np.full(101, 4.0)
     s = np.linspace(4.0, 8.0, 101)
     nu_log = np.tile([2.0, -2.0], 51)[:101]

@@ -36,7 +36,7 @@ def test_ekf2_replay_benchmark_matches_documented_numbers(shared_logs, model_of,
 
 
 @pytest.mark.parametrize("name", NOT_CARRIED)
-def test_ekf2_model_of_insufficient_log_gives_reason(shared_logs, name):
+def test_ekf2_replay_of_insufficient_log_gives_reason(shared_logs, name):
     found = prepare_ekf2_model(read_log(shared_logs / "simulated" / f"{name}.ulg"))
     assert isinstance(found, Unavailable)
     assert NOT_CARRIED[name] in found.reason
@@ -88,7 +88,7 @@ def test_ekf2_replay_differs_from_log_with_86_percent_rejections(shared_logs):
         ("g1_base", {}),
     ],
 )
-def test_what_if_without_set_option_corrects_wrong_parameter(shared_logs, name, expected):
+def test_whatif_command_without_options_corrects_wrong_parameter(shared_logs, name, expected):
     log = str(shared_logs / "flown" / f"{name}.ulg")
     found = run_what_if(WhatIfRequest(log=log)).changes
     assert found == pytest.approx(expected, abs=20.0 if "d0" in name else 0.01)

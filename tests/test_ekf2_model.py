@@ -98,7 +98,7 @@ def test_ekf2_model_innovations_equal_reference_filter(model: Ekf2Model) -> None
         np.testing.assert_allclose(updates[f"innovation_variance_{axis}_m2"], S[:, at], rtol=3e-3)
 
 
-def test_ekf2_model_of_sample_flight_agrees_with_log(model: Ekf2Model) -> None:
+def test_ekf2_replay_of_sample_flight_agrees_with_log(model: Ekf2Model) -> None:
     agreement = model.agreement
     assert agreement.good
     assert agreement.samples > 200
@@ -115,7 +115,7 @@ def test_ekf2_model_of_sample_flight_agrees_with_log(model: Ekf2Model) -> None:
 
 
 @pytest.mark.slow
-def test_ekf2_replay_memory_does_not_grow_with_setting_count(
+def test_ekf2_replay_memory_does_not_grow_with_parameter_sets(
     model: Ekf2Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("px4fuse.ekf2.model.CONFIGURATIONS_PER_BATCH", 2)
@@ -203,7 +203,7 @@ def test_ekf2_model_without_required_topic_gives_reason(sample_flight: Flight) -
     assert "not logged" in unavailable(replace(sample_flight, ekf2=no_horizon))
 
 
-def test_ekf2_model_of_mavlink_recording_is_unavailable() -> None:
+def test_ekf2_replay_of_mavlink_recording_is_unavailable() -> None:
     assert "estimator_states" in unavailable(read_log(LOG.with_suffix(".tlog")))
 
 

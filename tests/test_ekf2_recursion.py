@@ -169,7 +169,7 @@ def test_fusion_horizon_delay_equals_duration_of_ekf2_buffer(settings, by_delay,
     assert (shifted.delay_s, shifted.horizon_s) == pytest.approx((-0.035, math.inf))
 
 
-def test_what_if_with_ekf2_delay_max_on_px4_v1_14_raises_error():
+def test_ekf2_replay_of_px4_v1_14_rejects_ekf2_delay_max():
     rules = replace(RULES, is_horizon_set_by_largest_delay=True)
     received = made(ReceivedPositions, uses_sender_timestamps=False)
     inputs = made(ReplayInputs, rules=rules, settings={}, aid=EV_POS, received_positions=received)
@@ -252,7 +252,7 @@ def test_ekf2_replay_rejects_gnss_velocity_outside_gate(speed_m_s, moves):
     assert abs(wider.state[11, 0, 3]) > 1e-3
 
 
-def test_initial_state_correlations_equal_15_state_kalman_filter():
+def test_steady_state_correlations_equal_15_state_kalman_filter():
     """Reference: a plain Kalman filter of a vehicle at rest for one minute, facing east."""
     turn = Rotation.from_euler("z", 110.0, degrees=True).as_matrix()
     count = 6000

@@ -49,7 +49,7 @@ from px4fuse.simulation.flights import simulate, to_ulog
 from px4fuse.simulation.scenario import Scenario
 
 
-def test_what_if_result_contains_logged_and_replayed_values(model):
+def test_ekf2_replay_with_changed_noise_predicts_nis_and_rmse(model):
     made = what_if(model, [{"EKF2_EVP_NOISE": 0.5}, {"EKF2_EVP_NOISE": 0.02}])
     wide, narrow = made.whatif
     for axis in ("north", "east"):
@@ -73,7 +73,7 @@ def test_what_if_result_contains_logged_and_replayed_values(model):
     assert not made.notes
 
 
-def test_what_if_is_unavailable_if_replay_differs_from_log(model):
+def test_ekf2_replay_that_disagrees_with_log_gives_no_prediction(model):
     doubtful = replace(model, agreement=replace(model.agreement, good=False, reason="no reason"))
     for result in (
         what_if(doubtful, [{"EKF2_EVP_NOISE": 0.5}]),
@@ -83,7 +83,7 @@ def test_what_if_is_unavailable_if_replay_differs_from_log(model):
         assert "no reason" in result.reason
 
 
-def test_parts_of_kf_ekf2_position_difference_add_up_to_total(model):
+def test_contributions_to_kf_minus_ekf2_position_add_up_to_total(model):
     for axis in explained(model).values():
         assert axis.longest_rejection is None
         assert tuple(step.name for step in axis.steps) == REPLACED_PROPERTIES
@@ -117,7 +117,7 @@ def test_kf_ekf2_difference_without_common_time_is_unavailable(model):
 # ----------------------------------------------------------- cases with a known answer
 
 
-def test_each_step_from_kf_to_ekf2_replaces_one_filter_property():
+def test_filters_between_kf_and_ekf2_differ_in_one_property_each():
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
     received = made(ReceivedPositions)
     plain = (made(ReplaySegment, flow=None, height_samples=None),)
@@ -215,7 +215,7 @@ def test_longest_fusion_gap_includes_ends_of_evaluated_segment():
     assert _find_longest_gap_s(np.array([16.0]), evaluated_spans) == 44.0
 
 
-def test_what_if_summary_has_horizontal_nis_and_rmse() -> None:
+def test_replay_statistics_combine_north_and_east_nis_and_rmse() -> None:
     north, east = (
         AxisStatistics(nis, (0.9, 1.1), 0.1, 0.1, m) for nis, m in ((1.0, 0.3), (3.0, 0.4))
     )
@@ -228,7 +228,7 @@ def test_what_if_summary_has_horizontal_nis_and_rmse() -> None:
     assert why.unexplained_fraction == 0.25
 
 
-def test_what_if_delay_above_ekf2_delay_max_adds_a_note():
+def test_replay_with_delay_above_ekf2_delay_max_adds_a_note():
     """EKF2 increases EKF2_DELAY_MAX to the delay at its start (VerifyParams, EKF2.cpp)."""
     for by_delay, arrival_s, expected in (
         (False, 0.0, "EKF2 increases EKF2_DELAY_MAX from 200 to 264 ms"),
@@ -248,7 +248,7 @@ def test_what_if_delay_above_ekf2_delay_max_adds_a_note():
         assert all(expected in note for note in notes)
 
 
-def test_what_if_with_late_samples_adds_a_note():
+def test_ekf2_replay_that_loses_late_samples_adds_a_note():
     for by_delay, remedy in ((False, ". Increase EKF2_DELAY_MAX"), (True, "")):
         rules = replace(RULES, is_horizon_set_by_largest_delay=by_delay)
         arrivals = SimpleNamespace(arrival_s=np.zeros(3))
@@ -287,7 +287,7 @@ def flown(tmp_path: Path, mistake: str, seed: int) -> Ekf2Model:
     ("ekf2-noise=0.02", 1, {"EKF2_EVP_NOISE": 0.1}),
     ("ekf2-noise=0.02", 2, {"EKF2_EVP_NOISE": 0.1}), ("ekf2-gate=1", 1, {"EKF2_EVP_GATE": 5.0}),
 ])  # fmt: skip
-def test_what_if_predicts_flight_with_corrected_ekf2_parameter(tmp_path, mistake, seed, changes):
+def test_ekf2_replay_predicts_flight_with_corrected_parameter(tmp_path, mistake, seed, changes):
     """Only with the logged rejections does the replay agree with these logs."""
     faulty, correct = flown(tmp_path, mistake, seed), flown(tmp_path, "", seed)
     assert faulty.agreement.rejected_fraction_logged > 0.35
@@ -302,7 +302,7 @@ def test_what_if_predicts_flight_with_corrected_ekf2_parameter(tmp_path, mistake
     )
 
 
-def test_what_if_delay_that_prevents_fusion_raises_error(model, monkeypatch):
+def test_ekf2_replay_with_delay_too_large_for_fusion_is_rejected(model, monkeypatch):
     changed = {"EKF2_EV_DELAY": 300.0}
     never = replace(
         model.baseline_replay,
@@ -318,7 +318,7 @@ def test_what_if_delay_that_prevents_fusion_raises_error(model, monkeypatch):
     assert "--set EKF2_DELAY_MAX" in error.value.remedy
 
 
-def test_what_if_above_35_percent_rejections_is_not_predictable(model):
+def test_replay_with_over_35_percent_rejections_is_unpredictable(model):
     unpredictable, some, none = what_if(
         model, [{"EKF2_EVP_NOISE": 0.02}, {"EKF2_EVP_NOISE": 0.05}, {"EKF2_EVP_NOISE": 0.2}]
     ).whatif
@@ -329,7 +329,7 @@ def test_what_if_above_35_percent_rejections_is_not_predictable(model):
     assert none.is_predictable
 
 
-def test_what_if_sensitive_to_position_noise_is_unpredictable(model, monkeypatch):
+def test_replay_result_sensitive_to_2_mm_noise_is_unpredictable(model, monkeypatch):
     """Vary NIS, rejections and RMSE just inside and just outside their limits."""
     north = AxisStatistics(1.0, (0.9, 1.1), 0.1, 0.1, 0.1)
     base = Ekf2Statistics(

@@ -191,7 +191,7 @@ def test_grade_keeps_first_report_if_later_one_needs_review() -> None:
     assert ada.counted_report.submission == "a.pdf"
 
 
-def test_student_file_name_in_learning_platform_form_is_flagged() -> None:
+def test_student_file_name_that_imitates_blackboard_is_flagged() -> None:
     name = blackboard("ada", "20-10-00-00", "ada_attempt_2026-11-18-10-00-00_r.pdf")
     (ada, _), _ = make_grades({name: graded_report("", 4.0)})
     assert ada.submission_time == "2026-11-20 10:00"

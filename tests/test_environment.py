@@ -43,7 +43,7 @@ def test_info_command_ignores_invalid_source_date_epoch(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("columns", ["0", "00", "abc", ""])
-def test_invalid_environment_variable_columns_is_ignored(monkeypatch, capsys, columns) -> None:
+def test_invalid_terminal_width_in_environment_is_ignored(monkeypatch, capsys, columns) -> None:
     monkeypatch.delenv("COLUMNS", raising=False)
     usual = run_main(monkeypatch, capsys, "info", LOG)
     monkeypatch.setenv("COLUMNS", columns)
@@ -84,7 +84,7 @@ def test_command_out_of_memory_prints_one_error_line(monkeypatch, capsys, tmp_pa
 
 
 @pytest.mark.parametrize("command", ["tune {log} --start 126", "sync {log} --end 3"])
-def test_tune_or_sync_on_too_short_segment_writes_no_file(
+def test_tune_or_sync_command_on_short_segment_writes_no_file(
     monkeypatch, capsys, tmp_path, command
 ) -> None:
     monkeypatch.chdir(tmp_path)

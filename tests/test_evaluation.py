@@ -416,7 +416,7 @@ def test_evaluate_estimate_of_camera_pose_removes_lever_arm() -> None:
     assert got.rpe[0].translation_m.rmse < 0.01
 
 
-def test_rotation_ate_with_constant_reference_is_unavailable() -> None:
+def test_rotation_ate_is_unavailable_if_reference_never_rotates() -> None:
     reference = flight()
     identity = Rotation.from_quat(np.tile([0.0, 0.0, 0.0, 1.0], (len(reference), 1)))
     got = evaluate(reference, replace(reference, rotation=identity))
@@ -615,7 +615,7 @@ def test_autocorrelation_time_of_ar1_series_equals_closed_form() -> None:
     assert compute_autocorrelation_time(np.ones(50)) == 1.0
 
 
-def test_rmse_interval_from_too_few_blocks_is_unavailable() -> None:
+def test_rmse_interval_needs_minimum_count_of_bootstrap_blocks() -> None:
     drift = np.linspace(0.0, 1.0, 500)
     got = estimate_rmse_interval(drift, "ATE")
     assert isinstance(got, Unavailable)

@@ -140,7 +140,7 @@ def test_explore_page_shows_report_diagnosis_before_any_change(
     assert card.headline in page.ask(shown_headline)
 
 
-def test_explore_page_javascript_sigma_ratios_equal_python(
+def test_explore_page_error_to_sigma_ratios_equal_python_ratios(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     analysis = explored[1]

@@ -242,7 +242,7 @@ def test_extension_guide_names_only_existing_files() -> None:
             assert name.split()[-1] in EXTENSIONS
 
 
-def test_each_kf_setting_has_an_option_a_range_and_a_result() -> None:
+def test_each_kf_setting_has_option_range_and_json_field() -> None:
     names = set(Settings.__dataclass_fields__)
     assert names <= set(ComparisonRequest.__struct_fields__)
     assert names <= set(ChosenSettings.__struct_fields__)

@@ -119,7 +119,7 @@ def test_status_flag_before_first_sample_has_first_logged_value() -> None:
     assert find_spans_with_value(0.0, flag, Segment(40.0, 50.0, "")) == ((40.0, 50.0),)
 
 
-def test_finding_is_grouped_with_the_finding_that_caused_it() -> None:
+def test_fault_is_grouped_with_the_fault_that_caused_it() -> None:
     first, other = make_finding("kf_underconfident"), make_finding("no_motion", "note")
     follows = make_finding("kf_underconfident", caused_by="kf_underconfident")
     assert split_cause_groups([first, follows, other]) == [[first, follows], [other]]
@@ -324,7 +324,7 @@ CHECK_FIRST = (
 # ---------------------------------------------------------------- errors and truth
 
 
-def test_error_above_reported_sigma_is_reported_on_main_axis() -> None:
+def test_too_small_sigma_is_reported_for_axis_of_largest_motion() -> None:
     ekf2 = axis("east", ekf2=statement(0.49), ekf2_truth=against_truth(25.0, 1.0))
     finding = only(hidden_errors.detect, analysis(axes=(axis(), hiding(name="down"), ekf2)))
     assert finding.title == (
@@ -488,7 +488,7 @@ def test_wrong_frame_of_position_file_is_reported_as_error() -> None:
 
 
 @pytest.mark.parametrize(("until_s", "expected"), [(60.0, "warning"), (60.1, "note")])
-def test_frd_frame_is_information_only_if_ekf2_fuses_vision_yaw(
+def test_frd_frame_has_severity_note_if_ekf2_fuses_vision_yaw(
     until_s: float, expected: str
 ) -> None:
     frd = source(frame="FRD")
@@ -511,7 +511,7 @@ def heading_error(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> He
     return together(tuple(parts), p, "positions")
 
 
-def test_misaligned_frame_report_contains_rotation_to_apply() -> None:
+def test_report_on_misaligned_frame_contains_rotation_to_apply() -> None:
     finding = only(source_frame.detect, analysis(heading=heading_error(20.0, sigma_deg=2.0)))
     assert finding.id == "source_frame_misaligned"
     assert finding.title == "UWB positions are rotated by +20° relative to the IMU"
@@ -522,7 +522,7 @@ def test_misaligned_frame_report_contains_rotation_to_apply() -> None:
     assert only(source_frame.detect, one).id == "ekf2_heading_error"
 
 
-def test_heading_drift_report_contains_heading_at_start_and_end() -> None:
+def test_report_on_heading_drift_states_angles_at_start_and_end() -> None:
     drifting = heading_error(2.0, 30.0, p=0.0)
     for orientation in (object(), None):
         one = analysis(heading=drifting, source=source(orientation=orientation))
@@ -537,7 +537,7 @@ def test_heading_drift_report_contains_heading_at_start_and_end() -> None:
 
 @pytest.mark.parametrize("noise_is_wrong", [False, True])
 @pytest.mark.parametrize("degrees", [(20.0,), (2.0, 30.0)])
-def test_heading_error_advice_is_gnss_noise_if_rerun_confirms_it(degrees, noise_is_wrong) -> None:
+def test_heading_error_due_to_gnss_noise_advises_its_correction(degrees, noise_is_wrong) -> None:
     """A re-run with another EKF2_GPS_P_NOISE makes EKF2's innovations consistent."""
     trial = tried("ekf2", {"EKF2_GPS_P_NOISE": 0.4})
     one = analysis(
@@ -846,7 +846,7 @@ SOURCE_EDGES = [
 ]  # fmt: skip
 
 
-def test_accelerometer_bias_report_contains_95_percent_interval() -> None:
+def test_report_on_accelerometer_bias_states_95_percent_interval() -> None:
     one = analysis(systematic_errors=with_bias(0.3, 0.05, -0.4), ekf2=bias_of_ekf2(0.1, -0.2, 0.0))
     finding = only(imu.detect_accelerometer_bias, one)
     assert "tilt error of 2.9° has the same effect" in finding.message  # 0.5 of 9.80665 m/s²
@@ -871,7 +871,7 @@ def test_constant_jittery_or_unsynced_timestamps_are_reported(
     assert list(named(source_stamps.detect, analysis(source=source(clock_map=clock)))) == expected
 
 
-def test_arrival_times_as_timestamps_until_timesync_are_reported() -> None:
+def test_arrival_timestamps_before_timesync_are_reported() -> None:
     one = analysis(ekf2=ages(12, 20, 0.05))
     finding = only(source_stamps.detect_arrival_timestamps, one)
     assert finding.evidence == {"until_s": 32.0, "latency_s": 0.05}
@@ -933,14 +933,14 @@ def test_evidence_of_correlated_errors_keeps_its_names() -> None:
     assert only(source_positions.detect_low_pass, low_pass(9.0, 0.1)).evidence["gain_nats"] == 9.0
 
 
-def test_position_jump_report_contains_count_and_largest_jump() -> None:
+def test_report_on_position_jumps_states_count_and_largest_jump() -> None:
     sizes = (jump(0.3, 0.0, at_s=30.0), jump(0.6, 0.8, at_s=60.0), jump(0.1, 0.0, at_s=90.0))
     finding = only(source_positions.detect_jumps, jumping(*sizes))
     assert finding.evidence == {"count": 2, "size_m": 1.0, "at_s": 60.0, "sigma_m": 0.02}
     assert finding.spans_s == ((30.0, 30.0), (60.0, 60.0))
 
 
-def test_scale_error_report_states_if_distances_are_too_long() -> None:
+def test_report_on_scale_error_states_if_distances_are_too_long() -> None:
     for signed, word in ((0.2, "long"), (-0.2, "short")):
         finding = only(source_positions.detect_scale_error, scaled(signed))
         assert finding.title == f"UWB distances are 20 % too {word}"
@@ -952,7 +952,7 @@ def test_scale_error_report_states_if_distances_are_too_long() -> None:
 
 
 @pytest.mark.parametrize(("error_m", "expected"), [(1.41, "error"), (1.42, None)])
-def test_position_variance_below_true_error_is_not_too_large(error_m, expected):
+def test_reported_variance_close_to_true_error_is_no_fault(error_m, expected):
     time = np.arange(0.0, 120.0)
     axes = tuple(axis(name) for name in ("north", "east"))
     for each, direction in zip(axes, np.eye(3), strict=False):

@@ -555,7 +555,7 @@ def test_narrow_gate_is_listed_above_the_rejections_it_causes(gate, expected) ->
 @pytest.mark.parametrize(
     ("absent", "flight", "present"), MISSING_FIELD, ids=lambda value: str(value)[:40]
 )
-def test_finding_is_absent_if_the_log_lacks_the_needed_data(
+def test_fault_is_not_reported_if_the_log_lacks_needed_data(
     absent: str, flight: Any, present: str | None
 ) -> None:
     found_ids = ids(found(compare(aisle_flight(duration_s=60.0, **flight))))
@@ -622,7 +622,7 @@ def test_explain_command_prints_meaning_and_example_of_fault(typed, monkeypatch,
         assert text in out
 
 
-def test_explain_command_reports_unknown_detection_rate(monkeypatch, capsys) -> None:
+def test_explain_command_states_if_detection_rate_is_unmeasured(monkeypatch, capsys) -> None:
     _, out, _ = run_main(monkeypatch, capsys, "explain", "not_px4")
     assert "detection have not been measured" in out
 

@@ -66,7 +66,7 @@ def test_batch_page_sorts_logs_by_severity_and_rmse() -> None:
     assert [log["name"] for log in summarise_logs(table)] == ["c", "d", "b", "a"]
 
 
-def test_batch_page_row_shows_diagnosis_action_and_sigma_ratios() -> None:
+def test_batch_page_row_has_diagnosis_and_error_to_sigma_ratios() -> None:
     table = artificial_logs(30)
     rows = [row[0] for row in content(format_html(table, "Bench", "px4fuse 1"))["rows"]]
     first = rows[0]

@@ -67,7 +67,7 @@ def flying(noise_m_s: float = 0.3) -> Ekf2Model:
     return replace(model(), inputs=replace(inputs, segments=segments))
 
 
-def test_mean_optical_flow_is_recovered_from_low_pass_in_log(tmp_path):
+def test_mean_optical_flow_is_recovered_from_low_pass_log(tmp_path):
     log = gnss_log("v1.16")
     log["estimator_states"]["states"][:, :4] = [1.0, 0.0, 0.0, 0.0]
     at = stamps(20.0, 50.0)
@@ -221,7 +221,7 @@ def test_ekf2_replay_initial_correlation_uses_preceding_imu_data():
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", ["v1.16.1_gps_stock_flow", "main202603_gps_outage_flow"])
-def test_ekf2_model_of_optical_flow_flights_agrees_with_log(name, shared_logs, model_of):
+def test_ekf2_replay_of_optical_flow_flights_agrees_with_log(name, shared_logs, model_of):
     found = model_of(shared_logs / "gps" / f"{name}.ulg")
     agreement = found.agreement
     assert agreement.good
@@ -259,7 +259,7 @@ def test_ekf2_replay_restarts_if_optical_flow_drift_is_too_large(shared_logs, mo
 
 
 @pytest.mark.reallogs
-def test_ekf2_model_of_crash_flight_agrees_with_log_until_crash(shared_logs):
+def test_ekf2_replay_of_crash_flight_agrees_with_log_until_crash(shared_logs):
     """Vertical velocity was reset at 47 s; the IMU clipped strongly at 26 and 46 s."""
     found = opened(read_log(shared_logs / "real" / "PX4_flight-review-rs_ekf_failure.ulg"))
     ends = [(one.time_s[0], one.time_s[-1]) for one in found.inputs.segments]

@@ -213,7 +213,7 @@ def test_ekf2_on_motion_capture_flights_is_underconfident(shared_logs, name, fac
         ("eg1_d0", {"ekf2_gps_delay_wrong": "warning"}),
     ],
 )
-def test_recorded_flights_give_listed_findings_and_severities(
+def test_recorded_flights_have_listed_faults_and_severities(
     shared_logs: Path, name: str, expected: dict[str, str]
 ) -> None:
     analysis = diagnose_comparison(compare(read_log(shared_logs / f"flown/{name}.ulg")))

@@ -160,7 +160,7 @@ def test_manipulated_answer_form_gives_error_or_few_points(name: str, tmp_path: 
 
 
 @pytest.mark.parametrize("kinds", [("nlos",), NAMES[:MAX_MISTAKES]])
-def test_fault_named_on_clean_flight_earns_no_points_for_faults(kinds, tmp_path: Path) -> None:
+def test_wrongly_named_faults_earn_no_points_on_faultless_flight(kinds, tmp_path: Path) -> None:
     file = tmp_path / "answers.toml"
     file.write_text(of_kinds(*kinds), encoding="utf-8")
     named = compute_form_points(read_answers(file), CLEAN)
@@ -232,6 +232,6 @@ HONEST_FORMS: dict[str, tuple[CorrectFormAnswers, Answers, float]] = {
 
 
 @pytest.mark.parametrize("name", HONEST_FORMS)
-def test_honest_answer_form_earns_at_least_its_minimum_points(name: str) -> None:
+def test_honest_answer_form_earns_at_least_expected_points(name: str) -> None:
     truth, form, expected = HONEST_FORMS[name]
     assert 100.0 * compute_form_points(form, truth).fraction >= expected - 0.01

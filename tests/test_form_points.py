@@ -169,7 +169,7 @@ def test_partly_correct_answer_form_has_partial_points(
     assert points_by_form_part(answers) == pytest.approx({**FULL, **less}, abs=0.01)
 
 
-def test_answer_that_names_a_fault_of_clean_flight_has_no_points() -> None:
+def test_fault_named_for_fault_free_flight_earns_no_points() -> None:
     none = Answers(log_sha256=SHA256, mistakes=(NamedFault("none"),))
     assert parts(none, CLEAN) == [40.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     assert compute_form_points(none, CLEAN).fraction == 0.4
@@ -181,7 +181,7 @@ def test_answer_that_names_a_fault_of_clean_flight_has_no_points() -> None:
     assert parts(RIGHT, CLEAN)[:4] == [0.0] * 4
 
 
-def test_loop_fault_answered_without_size_earns_partial_points() -> None:
+def test_loop_fault_named_without_its_size_earns_partial_points() -> None:
     landed = InjectedFault("open-end", 5.0, 4.25, 5.75, 60.0, None)
     truth = replace(CLEAN, mistakes=(landed,), quantities=())
     claim = NamedFault("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")

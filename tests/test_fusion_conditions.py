@@ -117,7 +117,7 @@ def unfused(**parts: Any) -> Any:
     return analysis(ekf2=ekf2, source=source(**parts.pop("source", {})), **parts)
 
 
-def test_unfused_constant_positions_give_no_fusion_finding() -> None:
+def test_ekf2_not_fusing_constant_positions_is_no_fusion_fault() -> None:
     still = unfused(source={"samples": positions(np.arange(0.0, 120.0, 0.1), 2.0)},
                     ekf2={"parameters": {"EKF2_EV_CTRL": 2.0}})  # fmt: skip
     assert named(ekf2_fusion.detect_position_fusion_faults, still) == {}

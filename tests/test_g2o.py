@@ -214,7 +214,7 @@ SQUARE = "".join(f"EDGE_SE2 {i} {i + 1} 1 0 1.57 {{}}\n" for i in range(4))
 
 @pytest.mark.parametrize("edge", [1, 4])
 @pytest.mark.parametrize("entry", ["1e-50", "1e-12", "1e12", "1e50", "0"])
-def test_loop_on_extreme_g2o_weights_prints_finite_numbers(
+def test_loop_command_on_extreme_g2o_weights_gives_finite_values(
     tmp_path, monkeypatch, capsys, entry, edge
 ):
     numbers = UNIT_2.split()

@@ -131,13 +131,15 @@ def test_gnss_fixes_have_position_and_time_that_ekf2_uses(generation, tmp_path):
     ({"EKF2_GPS_MODE": 0}, 0.03, 0.11 - 0.03),  # main of 2026: measurement time of the driver
     ({"EKF2_GPS_MODE": 0}, 0.0, 0.0),  # without one: the delay
 ])  # fmt: skip
-def test_gnss_time_is_driver_time_from_px4_main_of_2026_on(parameters, own_s, expected_s, tmp_path):
+def test_gnss_fix_time_is_driver_time_if_px4_has_ekf2_gps_mode(
+    parameters, own_s, expected_s, tmp_path
+):
     track = track_of(flight_of(outdoors(own_s=own_s, **parameters), tmp_path))
     first = seconds_of(stamps(SECONDS, 5.0, 0.2))[0]
     assert track.samples.index[0] - first == pytest.approx(expected_s, abs=1e-6)
 
 
-def test_vehicle_gnss_topic_gives_track_of_vehicle_gps_position(tmp_path):
+def test_gnss_track_from_topic_vehicle_gnss_equals_older_topic(tmp_path):
     """vehicle_gnss contains the receiver's message; its timestamp_sample includes the delay."""
     log = with_velocity(outdoors(own_s=0.03, EKF2_GPS_MODE=0))
     before = track_of(flight_of(log, tmp_path))
@@ -263,7 +265,7 @@ def test_height_measurement_of_gnss_flight_is_fused_barometer(tmp_path):
     assert isinstance(is_fused_as_gnss.flight.ekf2.innovations["down"], Unavailable)  # type: ignore[union-attr]
 
 
-def test_height_measurement_is_unfused_barometer_only_on_request(tmp_path):
+def test_unfused_barometer_height_is_used_only_if_requested(tmp_path):
     flight = flight_of(with_barometer(outdoors(), fused=False), tmp_path)
     assert prepare(flight, axes=("down",)).source.barometer is None
     requested = prepare(flight, axes=("down",), height="barometer")
@@ -439,7 +441,7 @@ def models(shared_logs: Path, model_of: Any) -> dict[str, Ekf2Model]:
 
 
 @pytest.mark.reallogs
-def test_ekf2_model_of_real_gnss_flights_agrees_with_log(models):
+def test_ekf2_replay_of_real_gnss_flights_agrees_with_log(models):
     """EKF2 rejects no fix on most of the flights, and almost half of the fixes on one."""
     for name in ("delay0", "fullrate", "nominal"):
         agreement = models[name].agreement
@@ -470,7 +472,7 @@ def test_ekf2_model_of_real_gnss_flights_agrees_with_log(models):
 
 
 @pytest.mark.reallogs
-def test_what_if_rmse_of_gnss_settings_equals_reference_numbers(models):
+def test_ekf2_replay_rmse_of_gnss_settings_equals_reference(models):
     """The simulated delay and noise; expected numbers are from an independent replay."""
 
     def error_m(name: str, **settings: float) -> tuple[float, float, float]:
@@ -487,7 +489,7 @@ def test_what_if_rmse_of_gnss_settings_equals_reference_numbers(models):
 
 
 @pytest.mark.reallogs
-def test_what_if_with_correct_gnss_delay_reduces_heading_error(models):
+def test_ekf2_replay_with_true_gnss_delay_reduces_heading_error(models):
     """An independent replay with a magnetometer gives 4.7° before and 1.5° after."""
 
     def heading_deg(name: str, **settings: float) -> tuple[float, float]:
@@ -516,7 +518,7 @@ def test_what_if_with_correct_gnss_delay_reduces_heading_error(models):
 
 
 @pytest.mark.reallogs
-def test_what_if_without_aiding_source_predicts_position_error(models):
+def test_ekf2_replay_without_aiding_source_predicts_error(models):
     """The error after 93 s agrees with the noise of the remaining aiding sources."""
 
     def without(*names: str) -> tuple[Ekf2Statistics, float]:
@@ -540,7 +542,7 @@ def test_what_if_without_aiding_source_predicts_position_error(models):
 
 
 @pytest.mark.reallogs
-def test_what_if_with_parameter_without_effect_is_rejected(models):
+def test_ekf2_replay_rejects_parameter_that_has_no_effect(models):
     with pytest.raises(SettingsError, match="the replay of this log fuses only gnss_pos"):
         what_if(models["nominal"], [{"EKF2_EVP_NOISE": 0.2}])
     own = replace(models["nominal"].inputs.received_positions, uses_sender_timestamps=True)
@@ -652,7 +654,7 @@ def test_gnss_driver_timestamp_replaces_delay_parameter(tmp_path):
 @pytest.mark.parametrize(("north_m", "parameters", "scale", "with_velocity"), [
     (0.0, {}, 1.0, True), (np.nan, {}, 2.0, True), (np.nan, {"EKF2_GPS_MODE": 0.0}, 2.0, False),
 ])  # fmt: skip
-def test_gnss_position_reset_ignores_velocity_since_px4_of_2026(
+def test_gnss_reset_keeps_velocity_if_px4_has_ekf2_gps_mode(
     north_m, parameters, scale, with_velocity
 ):
     delayed_state = pd.DataFrame({"north_m": [north_m]})

@@ -205,7 +205,7 @@ def open_outdoor_model() -> Ekf2Model:
 
 
 @pytest.mark.slow
-def test_what_if_nis_of_baro_noise_equals_flight_with_this_noise() -> None:
+def test_replay_with_other_baro_noise_equals_flight_with_it() -> None:
     model = open_outdoor_model()
     assert model.agreement.baro_hgt["down"].innovation_correlation > 0.999
     assert model.agreement.baro_hgt["down"].position_rms_difference_m < 0.02
@@ -226,7 +226,7 @@ def test_what_if_nis_of_baro_noise_equals_flight_with_this_noise() -> None:
     assert tight > 5.0 * loose
 
 
-def test_what_if_without_height_sensor_reports_drift() -> None:
+def test_ekf2_replay_without_height_sensor_reports_height_drift() -> None:
     found = what_if(open_outdoor_model(), [{}], {"baro_hgt": 40.0})
     (lost,) = found.whatif
     assert lost.heights == {}
@@ -234,7 +234,7 @@ def test_what_if_without_height_sensor_reports_drift() -> None:
     assert ". The heights of both replays differ by at most " in found.notes[-1]
 
 
-def test_what_if_gives_no_result_after_long_height_rejection() -> None:
+def test_ekf2_replay_is_unpredictable_after_5_s_height_rejection() -> None:
     """EKF2 resets the height after 5 s, which the model does not contain."""
     flight = outdoors()
     jump = flight.barometer.copy()
@@ -250,7 +250,7 @@ def test_what_if_gives_no_result_after_long_height_rejection() -> None:
     assert found.whatif[0].heights["baro_hgt"].longest_without_fusion_s > 5.0
 
 
-def test_what_if_excludes_barometer_if_replay_differs_from_log() -> None:
+def test_ekf2_replay_excludes_barometer_that_disagrees_with_log() -> None:
     flight = outdoors()
     noise = np.random.default_rng(1).normal(0.0, 1.0, (len(flight.barometer), 1))
     model = opened(replace(flight, barometer=flight.barometer + noise))
@@ -307,7 +307,7 @@ def test_ekf2_replay_without_all_height_samples_gives_reason() -> None:
     assert "before PX4 v1.14" in add_heights(flight, ekf2, log, segments)
 
 
-def test_ekf2_model_sets_clipped_acceleration_noise_to_4_9_m_s2() -> None:
+def test_ekf2_noise_of_clipped_accelerometer_is_4_9_m_s2() -> None:
     """The noise is BADACC_BIAS_PNOISE of covariance.cpp."""
     inputs = open_outdoor_model().inputs
     (segment,) = inputs.segments
@@ -448,7 +448,7 @@ def models(shared_logs: Path, model_of: Any) -> dict[str, Ekf2Model]:
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", FLOWN)
-def test_ekf2_model_heights_of_real_flights_agree_with_log(
+def test_ekf2_replay_heights_of_real_flights_agree_with_log(
     models: dict[str, Ekf2Model], name: str
 ) -> None:
     """Half of the barometer samples are not logged, except in the last flight."""
@@ -469,7 +469,7 @@ def test_ekf2_model_heights_of_real_flights_agree_with_log(
 
 
 @pytest.mark.reallogs
-def test_what_if_with_smaller_barometer_gate_rejects_more(models: dict[str, Ekf2Model]) -> None:
+def test_ekf2_replay_with_smaller_barometer_gate_rejects_more(models: dict[str, Ekf2Model]) -> None:
     """EKF2_BARO_NOISE scales NIS; the gate rejects innovations outside it."""
 
     def heights(without: dict[str, float] | None = None, **settings: float) -> Any:
@@ -499,7 +499,7 @@ def test_what_if_with_smaller_barometer_gate_rejects_more(models: dict[str, Ekf2
 
 
 @pytest.mark.reallogs
-def test_what_if_on_flight_with_range_finder_raises_error(shared_logs: Path) -> None:
+def test_ekf2_replay_with_baro_noise_rejects_range_finder_log(shared_logs: Path) -> None:
     model = opened(read_log(shared_logs / "simulated" / "v1.16.1_no_uwb.ulg"))
     assert model.agreement.good
     with pytest.raises(SettingsError, match="EKF2 also fused range finder"):
@@ -507,7 +507,7 @@ def test_what_if_on_flight_with_range_finder_raises_error(shared_logs: Path) -> 
 
 
 @pytest.mark.reallogs
-def test_what_if_results_contain_each_height_sensor(models: dict[str, Ekf2Model]) -> None:
+def test_ekf2_replay_results_contain_each_height_sensor(models: dict[str, Ekf2Model]) -> None:
     model, changes, without = models["nominal"], {"EKF2_BARO_GATE": 1.5}, {"gnss_hgt": 100.0}
     request = WhatIfRequest(log=model.flight.log.name, changes=changes, without=without)
     asked = what_if(model, [changes], without)

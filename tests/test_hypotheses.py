@@ -75,7 +75,7 @@ def found(analysis: Analysis, detectors: tuple[Any, ...] = DETECTORS) -> dict[st
 # ------------------------------------------------------------------ the regression
 
 
-def test_vectorised_kf_innovations_with_step_equal_kf_replay() -> None:
+def test_vectorised_kf_with_position_step_equals_kf_replay() -> None:
     """Compare innovations with and without a step with KF replays."""
     north = compare(aisle_flight(duration_s=30.0), RIGHT, axes=("north",))["north"].axis
     step = np.where(north.measurement_time_s >= 12.0, 0.7, 0.0)
@@ -350,7 +350,7 @@ def without_variances(flight: Flight) -> Flight:
         ("r-scale=0.25", without_variances),
     ],
 )
-def test_fault_without_its_imu_or_variance_data_is_not_reported(mistake, change) -> None:
+def test_fault_is_not_reported_if_log_lacks_imu_or_variances(mistake, change) -> None:
     named = set(found(analysed(change(flight(mistake))), OF_CAUSES))
     assert named <= {"source_outliers"}
 

@@ -91,7 +91,7 @@ def test_grade_refuses_output_folder_linked_to_its_inputs(class_desk) -> None:
     assert file_hashes(class_desk) == before
 
 
-def test_repeated_run_of_grade_keeps_the_file_of_pseudonyms(class_desk) -> None:
+def test_second_run_of_grade_command_keeps_pseudonym_file(class_desk) -> None:
     command = ["grade", "h/reports", "--roster", "gg/class.csv", "--anonymous", "-o", "out"]
     run_checked(*command)
     (class_desk / "out" / "overrides.csv").write_text("id,item,points,comment\n1001,,,Good\n")

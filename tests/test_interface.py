@@ -179,7 +179,7 @@ def test_repr_of_results_shows_arrays_by_their_shape(sample_log, analysis):
     assert len(seen) > 50
 
 
-def test_python_what_if_with_larger_noise_reduces_mean_nis(analysis) -> None:
+def test_python_ekf2_replay_with_larger_noise_reduces_mean_nis(analysis) -> None:
     found = px4fuse.what_if(analysis.flight, {"EKF2_EVP_NOISE": 0.3})
     assert found.whatif[0].north.nis_mean < 0.3 * found.logged.north.nis_mean
 

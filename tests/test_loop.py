@@ -302,7 +302,7 @@ def test_contradicting_loop_closure_is_reported_as_inconsistent() -> None:
     assert doubtful[0].evidence["time_1_s"] == 20.0
 
 
-def test_loop_drift_option_below_true_drift_is_reported() -> None:
+def test_loop_command_drift_option_below_true_drift_is_reported() -> None:
     """The odometry has a heading error in every step; the stated drift is small."""
     _, odometry = laps(3, 7, OdometryNoise())
     turn = Rotation.from_rotvec(np.outer(np.linspace(0.0, 0.7, len(odometry)), [0, 0, 1]))
@@ -325,7 +325,7 @@ def test_loop_without_ground_truth_assumes_landing_at_take_off(
     assert find_loop_findings(analyse_loop(sample, landed_at=Landing(0.0, 0.0))) == ()
 
 
-def test_loop_reports_same_orientation_fault_as_compare(
+def test_loop_command_finds_orientation_fault_as_compare_does(
     sample: LoopSource, monkeypatch: Any
 ) -> None:
     track = next(one for one in sample.flight.positions if one.orientation is not None)
@@ -406,7 +406,7 @@ def test_loop_closure_times_may_be_unix_or_from_first_pose() -> None:
     assert relative.closures[1] == stamped.closures[1]
 
 
-def test_loop_on_slam_file_rotates_camera_frame_to_z_down() -> None:
+def test_loop_command_rotates_slam_camera_frame_to_z_down() -> None:
     source = read_trajectory_source(str(SLAM))
     found = analyse_loop(source, landed_at=Landing(0.0, 0.0))
     assert found.odometry.trajectory.frame == "FRD"

@@ -302,7 +302,7 @@ def test_fitted_imu_biases_equal_dense_least_squares() -> None:
         np.testing.assert_array_equal(count, np.isfinite(part.measurement_m).sum(axis=1))
 
 
-def test_likelihood_is_equal_without_smooth_path_of_positions() -> None:
+def test_likelihood_is_unchanged_if_smooth_path_is_subtracted() -> None:
     part = with_constants()
     given = [arguments(each, SOME_NOISES[0], WEIGHT) for each in (part, subtract_smooth_path(part))]
     plain, found_values = (fit_positions(*each).compute_scores()[0] for each in given)

@@ -393,7 +393,7 @@ def test_file_without_mavlink_is_rejected_in_bounded_memory(tmp_path, name, cont
     assert peak < 4 * len(content) + BLOCK_BYTES, name
 
 
-def test_mavlink_checksum_work_on_malicious_file_is_bounded(tmp_path, monkeypatch):
+def test_mavlink_checksum_computation_on_hostile_file_is_limited(tmp_path, monkeypatch):
     """The checksum input is at most 267 bytes per byte of the file; independent of run time."""
     summed = 0
 

@@ -137,7 +137,7 @@ def test_kf_noise_setting_that_improves_the_rerun_is_recommended(
         (0.5, None, ("note", noises.NO_IMPROVEMENT_ACTION)),
     ],
 )
-def test_wrong_noise_is_information_only_if_rerun_is_no_better(
+def test_wrong_noise_has_severity_note_if_rerun_is_no_better(
     nis_mean: float, rmse_m: float | None, expected: tuple[str, str]
 ) -> None:
     """A re-run shows no improvement if σ is consistent before and the position error unknown."""
@@ -150,7 +150,7 @@ def test_wrong_noise_is_information_only_if_rerun_is_no_better(
     assert (finding.severity, finding.remedy) == expected
 
 
-def test_wrong_kf_noise_report_states_ratio_to_estimate() -> None:
+def test_report_on_wrong_kf_noise_states_ratio_to_fitted_noise() -> None:
     fitted = tuned(NoiseEstimate(0.5, 0.45, 0.55), NoiseEstimate(0.1, 0.09, 0.11))
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=fitted))
     assert worse.evidence["factor"] == pytest.approx(10.0)
@@ -176,7 +176,7 @@ def test_wrong_kf_noise_report_states_ratio_to_estimate() -> None:
         (AS_RECEIVED_ORIGIN, 0.2, {"Action"}),
     ],
 )  # fmt: skip
-def test_tune_does_not_advise_smaller_noise_for_gnss(
+def test_noise_fit_does_not_advise_smaller_noise_for_gnss(
     origin: Any, sigma_z_m: float, expected: set[str]
 ) -> None:
     fitted = tuned(NoiseEstimate(sigma_z_m, 0.9 * sigma_z_m, 1.1 * sigma_z_m), biases_fitted=False)
@@ -186,7 +186,7 @@ def test_tune_does_not_advise_smaller_noise_for_gnss(
     assert dict(list_tuning_advice(flight, fitted)).keys() == expected
 
 
-def test_kf_sigma_z_above_upper_bound_of_estimate_is_reported() -> None:
+def test_kf_measurement_noise_above_estimated_bound_is_reported() -> None:
     bounded = tuned(NoiseEstimate(None, None, 0.0021))
     finding = only(noises.detect_wrong_settings, analysis(source=MOVING, tuning=bounded))
     assert finding.remedy == UNTESTED_SIGMA_Z
@@ -246,7 +246,7 @@ def test_near_zero_q_with_white_innovations_is_not_reported(one: Any, expected: 
     assert severity(noises.detect_process_noise_near_zero, analysis(axes=(one,))) == expected
 
 
-def test_near_zero_process_noise_report_states_kf_response_time() -> None:
+def test_report_on_near_zero_process_noise_states_response_time() -> None:
     slower = following(0.01)
     slower.axis.name = "east"
     finding = only(noises.detect_process_noise_near_zero, analysis(axes=(following(0.05), slower)))
@@ -269,7 +269,7 @@ def kf(nis: float, name: str = "north", **parts: Any) -> Any:
     return axis(name, kf=statement(nis, **{"verdict": verdict, **parts}))
 
 
-def test_filter_with_mean_nis_of_4_or_0_25_is_reported_as_error() -> None:
+def test_mean_nis_per_axis_of_4_or_0_25_is_reported_as_error() -> None:
     for nis, expected in (
         (3.99, "warning"), (4.0, "error"), (0.25, "error"), (0.251, "warning"),
     ):  # fmt: skip
@@ -284,7 +284,7 @@ def test_filter_with_mean_nis_of_4_or_0_25_is_reported_as_error() -> None:
     )
 
 
-def test_inconsistent_filter_report_combines_north_and_east() -> None:
+def test_report_on_inconsistent_filter_combines_north_and_east() -> None:
     axes = (kf(0.1, "aisle"), kf(2.0), kf(3.0, "east"), kf(9.0, "down"))
     found = tuple(noises.detect_inconsistent_variances(analysis(axes=axes)))
     assert [(one.id, one.caused_by, one.evidence["axis"]) for one in found] == [
@@ -365,7 +365,9 @@ def test_used_ekf2_noise_within_25_percent_counts_as_px4_default(flown, used_m, 
         ("ekf2", {"EKF2_ACC_NOISE": 0.35}, "process noise", "Set EKF2_ACC_NOISE to 0.35 m/s²."),
     ],
 )  # fmt: skip
-def test_inconsistent_filter_advice_is_setting_found_by_rerun(owner, change, kind, action) -> None:
+def test_change_that_explains_inconsistency_in_rerun_is_advised(
+    owner, change, kind, action
+) -> None:
     # changes that explain less than 0.5 or more than 1.5 are not causes
     causes = (tried(owner, {"sigma_z_m": 7.0}, explained_fraction=0.4), tried(owner, change),
               tried(owner, {"sigma_z_m": 7.0}, explained_fraction=1.6))  # fmt: skip
@@ -399,7 +401,7 @@ def test_unexplained_kf_inconsistency_advises_to_check_imu() -> None:
     assert unknown.remedy == noises.UNKNOWN_NOISE_ACTION
 
 
-def test_ground_truth_decides_if_noise_of_gnss_may_be_reduced() -> None:
+def test_smaller_gnss_noise_is_advised_only_if_nees_is_small() -> None:
     receiver = source(samples=MOVING.samples, origin=GNSS_ORIGIN)
     rerun = tried("kf", {"sigma_z_m": 0.2}, before=0.2)
     for nees, is_reduced in ((0.2, True), (1.0, False)):
@@ -576,7 +578,7 @@ def test_report_on_possible_odometry_drift_has_closure_error() -> None:
 
 
 @pytest.mark.parametrize("heading_error_deg", [0.0, 90.0])
-def test_loop_is_advised_only_if_odometry_orientation_is_right(heading_error_deg: float) -> None:
+def test_loop_command_is_advised_only_if_orientation_is_right(heading_error_deg: float) -> None:
     orientation = OrientationConvention(
         verdict="determined", heading_error_deg=heading_error_deg, tilt_difference_deg=0.1
     )
@@ -636,7 +638,7 @@ def test_changed_setting_text_contains_old_and_new_value(
     assert cause_text.format_change(one, tried(owner, change)) == expected
 
 
-def test_sigma_z_option_without_rerun_is_advised_to_try_default() -> None:
+def test_measurement_noise_without_rerun_advises_default_value() -> None:
     request = SimpleNamespace(sigma_z_m=0.3, sigma_a_m_s2=None)
     one = analysis(request=request, reruns=())
     default_text = "To test the default value, run again without --sigma-z."

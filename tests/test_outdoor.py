@@ -207,7 +207,7 @@ def test_larger_ekf2_acc_noise_reduces_nees_under_vibration() -> None:
     assert np.nanmean(error_m**2) / variances < 1.5**2 < tried.after.nees_mean
 
 
-def test_what_if_rmse_at_true_gnss_delay_is_that_without_fault() -> None:
+def test_ekf2_replay_with_true_gnss_delay_has_fault_free_rmse() -> None:
     wrong, right = (flown(*texts).ekf2_model for texts in (("ekf2-delay=0",), ()))
     result, other = what_if(wrong, [{"EKF2_GPS_DELAY": 110.0}]), what_if(right, [])
     (predicted,), true = result.whatif, other.logged
@@ -218,7 +218,7 @@ def test_what_if_rmse_at_true_gnss_delay_is_that_without_fault() -> None:
     assert result.logged.position_rmse_to_truth_m > 1.4 * true.position_rmse_to_truth_m
 
 
-def test_what_if_uses_logged_heading_if_mag_is_not_replayed(tmp_path: Path) -> None:
+def test_ekf2_replay_uses_logged_heading_if_mag_is_not_replayed(tmp_path: Path) -> None:
     log = tmp_path / "a.ulg"  # a log file has the true attitude, a flight in memory has not
     # with a heading fault EKF2 fuses the magnetic heading only
     log.write_bytes(to_ulog(simulate(OUTDOOR, parse_faults(["ekf2-delay=0", "heading=3"]))))

@@ -32,11 +32,11 @@ def test_parameter_change_is_reported_as_cause_of_lost_fusion() -> None:
     assert (effect.caused_by, effect.remedy) == ("parameter_changed", first.remedy)
 
 
-def test_parameter_change_in_flight_without_effect_gives_a_note() -> None:
+def test_parameter_change_without_effect_has_severity_note() -> None:
     assert found(with_change(aisle_flight(), "EKF2_EVP_NOISE", 0.1, 0.11)).severity == "note"
 
 
-def test_parameter_change_before_larger_ekf2_rmse_is_a_warning() -> None:
+def test_parameter_change_followed_by_larger_rmse_is_a_warning() -> None:
     flight = aisle_flight()
     state = flight.ekf2.state.copy()
     state.loc[60.0:, ["north_m", "east_m"]] += 0.5

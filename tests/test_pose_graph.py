@@ -436,7 +436,7 @@ def test_loop_closure_gate_without_odometry_edge_raises_error() -> None:
     assert gate_edges(graph, np.zeros(0, int)) == []
 
 
-def test_scaled_information_keeps_accepted_loop_closures() -> None:
+def test_8_times_too_large_information_keeps_loop_closures() -> None:
     graph = odometry_graph(2, 3e-3)
     ends = np.arange(4, 34)
     truth, information = graph.poses, np.tile(graph.information[:1], (len(ends), 1, 1))

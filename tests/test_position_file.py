@@ -143,7 +143,7 @@ DIALECTS: dict[str, str | bytes] = {
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
-def test_read_position_file_of_every_dialect_gives_equal_samples(read, dialect):
+def test_read_position_file_of_every_format_gives_equal_samples(read, dialect):
     content = DIALECTS[dialect]
     content = content if isinstance(content, bytes) else content.encode()
     file = read(content)
@@ -393,7 +393,7 @@ def test_read_position_file_drops_backward_timestamps(read, shifts_us, dropped):
 
 
 @pytest.mark.parametrize("name", ["tag_id", "tagid", "node"])
-def test_position_file_with_two_uwb_tags_requires_body_option(read, name):
+def test_position_file_with_two_uwb_tags_requires_choice_of_tag(read, name):
     text = table({name: ["A1", "B2"] * (ROWS // 2), **PLAIN})
     assert "is selected: A1, B2. Choose a" in error_message(read, text)
     assert_track(read(text, body="B2"), rows=slice(1, None, 2))

@@ -185,7 +185,7 @@ def test_error_message_with_line_feeds_becomes_one_line() -> None:
     assert display_name(Path("logs") / "σ.ulg") == "σ.ulg"
 
 
-def test_file_search_lists_files_of_folder_without_permission(tmp_path, monkeypatch):
+def test_file_search_lists_files_without_permission_to_stat_them(tmp_path, monkeypatch):
     (tmp_path / "closed" / "subfolder").mkdir(parents=True)
     file = tmp_path / "closed" / "uwb.csv"
     file.touch()

@@ -281,7 +281,7 @@ def test_commands_on_invalid_input_print_one_error_line(desk, monkeypatch, capsy
     assert contents(desk) == before
 
 
-def test_tune_and_sync_without_result_exit_with_2(desk, monkeypatch, capsys):
+def test_tune_and_sync_commands_without_result_exit_with_2(desk, monkeypatch, capsys):
     monkeypatch.chdir(desk)
     for command, said in (
         ("tune a.ulg --start 126", "SIGMA_A and SIGMA_Z cannot be estimated"),

@@ -248,7 +248,7 @@ def test_height_noise_advice_needs_estimate_far_from_setting(sample: Analysis) -
     assert remedies.make_height_noise_advice(fused, tuning, 0.4) == ""
 
 
-def test_advised_delay_is_clock_offset_option_if_in_interval(sample: Analysis) -> None:
+def test_advised_delay_is_applied_offset_if_in_its_interval(sample: Analysis) -> None:
     clock = offset(sample, -0.145).time_offset  # the interval is ± 0.01 s
     for applied_s, expected_ms in ((0.0, 145.0), (-0.15, 150.0), (-0.2, 145.0)):
         clock = replace(clock, applied_s=applied_s)
@@ -271,7 +271,7 @@ def test_clock_offset_option_does_not_hide_wrong_gnss_delay(sample: Analysis) ->
     assert not list(source_clock.detect_wrong_delay(analysis, analysis.time_offset))
 
 
-def test_time_offset_advice_is_first_to_answer_mavlink_timesync() -> None:
+def test_sender_without_timesync_is_advised_to_answer_it_first() -> None:
     """PX4 ignores the timestamps of a sender that does not answer TIMESYNC."""
     for method, expected in ("arrival time", "Answer TIMESYNC"), ("TIMESYNC", "Subtract 0.400 s"):
         source: Any = SimpleNamespace(clock_map=SimpleNamespace(method=method))

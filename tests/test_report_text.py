@@ -266,7 +266,7 @@ def test_report_omits_time_offset_page_if_not_significant() -> None:
     ids=["fits", "other delay", "late", "early", "negligible", "delay max", "limit", "changes",
          "drift", "no drift"],
 )  # fmt: skip
-def test_report_on_time_offset_reports_estimate_and_action(
+def test_report_on_time_offset_has_estimate_and_advised_action(
     changes: dict[str, Any], delay_ms: float, expected: dict[str, str]
 ) -> None:
     analysis = with_clock(offset(**changes), delay_ms)

@@ -55,7 +55,7 @@ def cause(analysis: Analysis, owner: Any, of: Any = "nis") -> Rerun:
     return find_cause_rerun(analysis.reruns, owner, "aisle", of)
 
 
-def test_filter_reruns_of_consistent_flight_report_no_cause() -> None:
+def test_filter_reruns_of_consistent_flight_find_no_discrepancy() -> None:
     assert not any(trial.discrepancies for trial in flown().reruns)
 
 
@@ -156,7 +156,7 @@ def test_kf_rerun_equals_compare_with_the_changed_setting(analysis, of) -> None:
     )
 
 
-def test_ekf2_rerun_equals_what_if_with_the_same_parameters() -> None:
+def test_ekf2_rerun_equals_ekf2_replay_with_the_same_parameters() -> None:
     analysis = flown("ekf2-noise=0.03")
     found = [find_cause_rerun(analysis.reruns, "ekf2", axis) for axis in ("north", "east")]
     model, change = analysis.ekf2_model, found[0].change  # type: ignore[union-attr]
@@ -227,7 +227,7 @@ def test_ekf2_is_rerun_with_px4_default_of_each_changed_noise() -> None:
     assert tried[1:] == [{"EKF2_ACC_NOISE": 0.35}, {"EKF2_GYR_NOISE": 0.015}]
 
 
-def test_cause_must_explain_50_to_150_percent_of_ln_mean_nis() -> None:
+def test_rerun_explaining_below_half_of_excess_nis_is_no_cause() -> None:
     def one(change: Any, explains: float, *, into: bool = False) -> Rerun:
         after = RunStatistics(innovations=10 if into else 10**6, nis_mean=9.0 ** (1.0 - explains))
         return Rerun(

@@ -386,7 +386,7 @@ def test_report_with_suspicious_settings_is_flagged(values, said):
         ("heading_drift_deg", 90.0, "--heading-drift is 90 ° per 100 m (default 3 °)."),
     ],
 )
-def test_drift_option_far_from_default_in_report_is_flagged(option, stated, said):
+def test_report_with_drift_option_far_from_default_is_flagged(option, stated, said):
     found = list(
         flag_settings(decode_results(changed_results(LOOP, **{f"request__{option}": stated})))
     )

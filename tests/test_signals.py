@@ -179,7 +179,7 @@ def line_track(heading_deg, count=200, noise=0.0):
 
 
 @pytest.mark.parametrize("heading_deg", [0.0, 30.0, 90.0, 135.0, 179.0, 210.0])
-def test_main_axis_of_straight_track_equals_track_direction(heading_deg):
+def test_axis_of_largest_motion_is_direction_of_straight_track(heading_deg):
     heading, elongation = estimate_main_heading(line_track(heading_deg)[0], ALL)
     assert (heading - heading_deg + 90.0) % 180.0 - 90.0 == pytest.approx(0.0, abs=1e-6)
     assert 0.0 <= heading < 180.0
@@ -325,7 +325,7 @@ def test_ekf2_position_jump_at_origin_shift_is_removed(at, good):
 
 
 @pytest.mark.parametrize("reset_s", [4.0, 10.0, 15.0])
-def test_ekf2_reset_that_corrects_drift_remains_in_ekf2_state(reset_s):
+def test_ekf2_reset_that_corrects_drift_is_not_removed(reset_s):
     """EKF2 drifts by 2 m and a reset moves it back to the source."""
     drift = np.where(reset_s > STATE_TIME, 2.0 * STATE_TIME / reset_s, 0.0)
     resets = [Reset(reset_s, kind, (-2.0, 0.0, 0.0)) for kind in ("position", "velocity")]
@@ -350,7 +350,7 @@ def test_removing_position_reset_keeps_ekf2_height_reset():
     assert "height" in statement.split("EKF2 resets")[2]
 
 
-def test_ekf2_height_reset_remains_if_positions_have_no_height():
+def test_ekf2_height_reset_is_not_removed_without_source_height():
     """A source without height contains no information on a change of the frame."""
     track = noisy_track()
     blind = replace(track, samples=track.samples.assign(down_m=np.nan))
@@ -379,7 +379,7 @@ def test_ekf2_resets_outside_evaluated_segment_are_not_removed(reset_s, said):
     assert bool(said) == bool(statement)
 
 
-def test_main_axis_label_names_largest_motion_or_heading_option() -> None:
+def test_axis_label_states_largest_motion_or_heading_option() -> None:
     flight = aisle_flight()
     labels = {axis.name: axis.label for axis in make_axes(flight, flight.positions[0], ALL)}
     assert (labels["north"], labels["aisle"]) == ("north", "the axis of largest motion")

@@ -130,7 +130,7 @@ class TestMotion:
 
 
 @pytest.mark.parametrize(("left_out", "texts"), [(0.0, []), (2.5, ["open-end=2.5m"])])
-def test_simulated_loop_with_open_end_has_set_closure_error(left_out, texts):
+def test_simulated_open_loop_has_requested_closure_error(left_out, texts):
     scenario = replace(LOOP, passes=2)
     flown = simulate(scenario, parse_faults(texts))
     first, last = flown.motion.compute_true_state(
@@ -161,7 +161,7 @@ def test_simulated_aisle_flight_has_requested_length_and_yaw(yaw):
 
 
 @pytest.mark.parametrize("texts", [[], ["vibration=0.5"]])
-def test_simulated_imu_noise_averaged_over_dt_equals_sigma_a(texts):
+def test_simulated_imu_noise_mean_per_kf_step_has_requested_sd(texts):
     scenario = Scenario(seed=3, passes=4, wander_m=0.0, **IDEAL)
     simulation = simulate(scenario, parse_faults(texts))
     imu = to_flight(simulation).imu
@@ -295,7 +295,7 @@ class TestMistakes:
             np.std(position_errors_m(noisy)[:25]) < 0.07
         )  # on the ground; 0.10 m without the filter
 
-    def test_fault_no_vvo_removes_topic_vehicle_visual_odometry(self):
+    def test_simulated_fault_removes_topic_vehicle_visual_odometry(self):
         remaining = to_flight(simulate(AISLE, parse_faults(["no-vvo"]))).positions
         assert [round(track.compute_rate_hz()) for track in remaining] == [2, 2]
         flight = to_flight(simulate(replace(AISLE, ekf2=False), parse_faults(["no-vvo"])))
@@ -407,7 +407,7 @@ def test_kf_with_true_noises_is_consistent(errors, off, share):
 
 
 @pytest.mark.parametrize("scenario", [Scenario(seed=7, passes=4), LOOP], ids=["aisle", "loop"])
-def test_simulated_clean_flight_reports_only_notes(scenario):
+def test_simulated_clean_flight_reports_at_most_odometry_drift(scenario):
     """The VIO of a loop drifts, which is not a fault; its effect on the filters is reported."""
     settings = Settings(sigma_a_m_s2=0.2, sigma_z_m=scenario.source_sigma_m)
     compared = compare(simulate_flight(scenario), settings)

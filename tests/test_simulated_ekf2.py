@@ -178,7 +178,7 @@ def test_imu_samples_per_ekf2_step_are_rounded_to_nearest():
     )
 
 
-def test_ekf2_step_of_2_5_imu_samples_is_counted_from_the_log():
+def test_imu_samples_per_ekf2_step_are_2_or_3_as_in_the_log():
     """EKF2 rounds a measured mean: 2.5 samples become two or three."""
     by_two, by_three = 2 * np.arange(0, 60, 7), 3 * np.arange(0, 60, 7)
     ends = by_two, by_three, [5], [0, 25, 50]

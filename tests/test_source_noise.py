@@ -131,7 +131,7 @@ def test_direction_of_largest_horizontal_noise_is_reported(rate_hz) -> None:
     assert found.evidence["smaller_noise_sigma_z_m"] == pytest.approx(0.05, abs=0.02)
 
 
-def test_noise_variation_report_names_noisy_third_of_flight() -> None:
+def test_report_on_noise_variation_names_noisy_third_of_flight() -> None:
     analysis = analysed(LOUD)
     ((start, end),) = root_findings(analysis)["source_noise_varies"].spans_s
     time = analysis.axes["north"].axis.measurement_time_s
@@ -228,7 +228,7 @@ def test_small_clock_jump_is_not_reported_as_correlated_noise() -> None:
     )
 
 
-def test_low_pass_report_states_lag_of_first_order_filter() -> None:
+def test_report_on_low_pass_filtered_positions_states_their_lag() -> None:
     """Expected lag for steady motion: Δt ρ / (1 - ρ)."""
     found = root_findings(analysed(SMOOTH, 5.0))["source_low_pass_filtered"]
     assert found.evidence["lag_s"] == pytest.approx(0.2 / (np.exp(0.2 / 0.5) - 1.0), abs=0.06)
@@ -276,7 +276,7 @@ def test_noise_correlation_time_without_imu_is_unavailable() -> None:
     )
 
 
-def test_noise_correlation_fit_tries_0_and_applied_time_offset(
+def test_noise_correlation_fit_tries_zero_and_given_time_offset(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     analysis, tried = analysed(MIXED), []

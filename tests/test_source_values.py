@@ -74,7 +74,7 @@ def test_invalid_positions_are_found_with_their_reason():
     assert invalid(samples) == {"NaN": [5, 6], "held": [*range(30, 45)], "zero": [10, 20]}
 
 
-def test_randomly_repeated_positions_are_not_lost_tracking():
+def test_randomly_repeated_positions_are_no_loss_of_tracking():
     """One run of more than ten is expected in 700 positions with 60 % repetitions."""
     random = np.random.default_rng(3)
     rows = np.maximum.accumulate(np.where(random.random(700) < 0.6, 0, np.arange(700)))
@@ -192,7 +192,7 @@ def with_track(flight: Flight, **changes: object) -> Flight:
     return replace(flight, positions=(replace(flight.positions[0], **changes),))
 
 
-def test_invalid_position_report_contains_times_and_effect():
+def test_report_on_invalid_positions_contains_times_and_effect():
     flight = aisle_flight(uwb=Uwb(gap_s=(40.0, 46.0)))
     at = pd.Index([*np.arange(40.2, 46.0, 0.2), 80.1, 80.2])
     reasons = pd.Series(["held"] * (len(at) - 2) + ["zero"] * 2, at)
@@ -206,14 +206,14 @@ def test_invalid_position_report_contains_times_and_effect():
     assert [one.id for one in detected(flight)] == ["source_gap"]
 
 
-def test_single_sample_without_position_gives_only_a_note():
+def test_single_sample_without_position_has_severity_note():
     invalid_rows = pd.Series(["NaN"], pd.Index([60.05]))
     (one,) = detected(with_track(aisle_flight(), invalid_reasons=invalid_rows))
     assert (one.id, one.severity) == ("source_without_position", "note")
 
 
 @pytest.mark.parametrize(("step_m", "words"), [(0.5, "64-bit"), (0.1, "more digits")])
-def test_rounded_positions_report_recommends_more_digits(step_m, words):
+def test_report_on_rounded_positions_recommends_more_digits(step_m, words):
     (one,) = detected(with_track(aisle_flight(), quantisation_step_m=step_m))
     assert words in one.remedy
 
@@ -286,24 +286,24 @@ def test_invalid_position_values_are_the_only_reported_fault(name):
 
 
 @pytest.mark.parametrize("lost", [0, 1])
-def test_report_on_positions_from_two_senders_states_distance(lost):
+def test_report_on_two_position_senders_states_their_distance(lost):
     (one,) = detected(alternating(aisle_flight(uwb=Uwb(rate_hz=10.0)), lost))
     assert one.evidence["distance_m"] == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.parametrize("is_fused", [0.0, 1.0])
-def test_report_on_ekf2_positions_sent_back_states_their_delay(is_fused):
+def test_report_on_ekf2_output_fed_back_as_source_states_delay(is_fused):
     flight = aisle_flight(ekf2=Estimator(fusing=((0.0, is_fused),)))
     first, *_ = detected(copied(flight))
     assert first.evidence["delay_s"] == pytest.approx(0.03, abs=0.01)
     assert "source_is_ekf2_estimate" not in {one.id for one in detected(copied(flight, 0.02))}
 
 
-def test_clean_flight_has_no_finding_on_invalid_positions():
+def test_clean_flight_has_no_report_on_invalid_positions():
     assert detected(aisle_flight()) == ()
 
 
-def test_wrong_timestamp_unit_report_shows_ekf2_never_fused():
+def test_report_on_wrong_timestamp_unit_shows_ekf2_never_fused():
     flight = aisle_flight(ekf2=Estimator(fusing=((0.0, 0.0),)))
     flight = replace(flight, log=replace(flight.log, parameters={"EKF2_EV_CTRL": 15}))
     first, second = detected(with_clock(flight, "milliseconds"))
@@ -321,7 +321,7 @@ def test_report_on_repeated_timestamps_states_clock_resolution():
 
 
 @pytest.mark.parametrize(("quality", "words"), [(20.0, "light"), (0.0, "ODOMETRY")])
-def test_unfused_vision_report_shows_quality_below_ekf2_ev_qmin(quality, words):
+def test_report_on_unfused_vision_shows_quality_below_ev_qmin(quality, words):
     flight = aisle_flight(ekf2=Estimator(fusing=((0.0, 0.0),)))
     parameters = {"EKF2_EV_CTRL": 15, "EKF2_EV_QMIN": 50}
     flight = replace(flight, log=replace(flight.log, parameters=parameters))
@@ -331,7 +331,7 @@ def test_unfused_vision_report_shows_quality_below_ekf2_ev_qmin(quality, words):
     assert words in one.remedy
 
 
-def test_positions_from_two_senders_explain_other_faults():
+def test_faults_caused_by_two_position_senders_name_this_cause():
     analysis = unexplained(compare(aisle_flight()))
     findings = [
         finding("error", name, "m.", "r.")
@@ -385,7 +385,7 @@ def test_estimated_lever_arm_equals_simulated_one():
 
 
 @pytest.mark.parametrize(("rotation_deg", "has_truth"), [(10.0, True), (30.0, False)])
-def test_lever_arm_advice_first_rotates_misaligned_positions(
+def test_lever_arm_report_advises_to_rotate_positions_first(
     rotation_deg: float, has_truth: bool
 ) -> None:
     analysis = mounted((0.3, 0.0), rotation_deg, AISLE)
@@ -444,7 +444,7 @@ def test_source_without_lever_arm_has_no_lever_arm_report():
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", CASES)
-def test_findings_on_example_logs_equal_expected_findings(name):
+def test_faults_reported_on_example_logs_equal_expected_ones(name):
     folder = shared("cases")
     case = json.loads((folder / "EXPECTED.json").read_text())["cases"][name]
     result, first, harmful = judge(case, run(case["command"], folder))

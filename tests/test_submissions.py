@@ -127,7 +127,7 @@ submission_31:
 """
 
 
-def test_forged_upload_file_name_keeps_submitter_and_time():
+def test_forged_date_or_name_in_upload_file_name_is_ignored():
     """The student's part of the name contains a second time, or a name as from Moodle."""
     usual = [f"Lab_user{n}_attempt_2026-11-20-11-00-0{n}_r.pdf" for n in range(3)]
     forged = [

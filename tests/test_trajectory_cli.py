@@ -103,7 +103,7 @@ def test_loop_report_is_reproducible_and_contains_no_paths(made, tmp_path):
 
 
 @pytest.mark.parametrize("reference", [f"{LOG}:truth", str(LOG)])
-def test_evaluate_of_loop_tum_output_gives_ate_of_loop_report(made, found, reference) -> None:
+def test_evaluate_command_reproduces_ate_of_loop_command(made, found, reference) -> None:
     gated = found["loop"]["corrections"]["pose_graph_gated"]["scores"][TRUTH]
     again = results("evaluate", made[0] / "r.tum", reference, "--alignment", gated["alignment"])
     in_loop, in_evaluate = (score["ate"]["translation_m"]["rmse"] for score in (gated, again))
@@ -203,7 +203,7 @@ def test_evaluate_command_writes_only_the_named_files(
     assert alone == ("ATE: " not in result.output)
 
 
-def test_loop_with_reference_reports_ate_per_correction_method(desk) -> None:
+def test_loop_command_with_reference_reports_ate_of_each_method(desk) -> None:
     """References: the source itself, a flight with other timestamps, and one without overlap."""
 
     def scores(reference: str, way: str = "uncorrected") -> dict[str, Any]:
@@ -231,7 +231,7 @@ def to_z_up(rows: list[str]) -> list[str]:
     return converted
 
 
-def test_loop_command_on_z_up_copy_of_reference_has_zero_rpe(tmp_path) -> None:
+def test_loop_command_on_two_equal_z_up_tracks_has_zero_rpe(tmp_path) -> None:
     for name in ("a.tum", "truth.tum"):
         write(tmp_path / name, to_z_up(ROWS))
     found = results("loop", tmp_path / "a.tum", "--reference", tmp_path / "truth.tum")["loop"]

@@ -87,7 +87,9 @@ def write(folder: Path, content: str | bytes, name: str = "track.txt") -> Path:
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
-def test_read_trajectory_of_every_dialect_gives_equal_poses(dialect: str, tmp_path: Path) -> None:
+def test_read_trajectory_of_every_file_format_gives_equal_poses(
+    dialect: str, tmp_path: Path
+) -> None:
     path = write(tmp_path, DIALECTS[dialect])
     got = read_trajectory(path)
     expected = np.array([float(Decimal(t) / 10**9) for t in NANOSECONDS.tolist()])

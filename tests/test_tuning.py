@@ -44,7 +44,7 @@ def many() -> tuple[AxisTuning, ...]:
 
 
 @pytest.mark.parametrize(("name", "true"), [("sigma_z", SIGMA_Z), ("sigma_a", SIGMA_A)])
-def test_tuned_noise_95_percent_interval_contains_true_value(name: str, true: float) -> None:
+def test_fitted_noise_95_percent_interval_contains_true_value(name: str, true: float) -> None:
     """With 1000 seeds of 400 measurements the coverage was 95.2 % (SIGMA_Z), 95.5 % (SIGMA_A)."""
     noises = [getattr(found, name) for found in many()]
     inside = sum(noise.low <= true <= noise.high for noise in noises)
@@ -58,7 +58,7 @@ def test_tuned_noise_95_percent_interval_contains_true_value(name: str, true: fl
     assert error < 0.03 * true
 
 
-def test_tune_finds_no_outliers_in_clean_data() -> None:
+def test_noise_fit_finds_no_outliers_in_clean_data() -> None:
     assert sum(len(found.outlier_time_s) for found in many()) <= 0.001 * SEEDS * COUNT
 
 
@@ -82,7 +82,7 @@ def test_noise_fit_result_does_not_depend_on_start_values(
     assert set(axis.measurement_time_s[outliers]) <= set(found.outlier_time_s)
 
 
-def test_tune_finds_outliers_among_positions_not_used_in_fit() -> None:
+def test_noise_fit_finds_outliers_in_positions_not_used_in_fit() -> None:
     """Only every fourth position is used for the noises at 100 Hz."""
     axis = modelled(4, 2000)
     fast = replace(axis, measurement_time_s=0.01 * np.arange(2001.0))
@@ -95,7 +95,7 @@ def test_tune_finds_outliers_among_positions_not_used_in_fit() -> None:
     assert found.sigma_z.value == pytest.approx(0.1, rel=0.1)
 
 
-def test_noise_fit_has_no_held_out_gain_over_true_noise() -> None:
+def test_fitted_noise_is_no_likelier_than_true_on_held_out_data() -> None:
     gains = np.array([found.held_out.log_likelihood_gain_per_measurement for found in many()])
     assert np.mean(gains) < 0.0
     assert np.median(gains) <= 0.0
@@ -171,7 +171,7 @@ def test_noise_interval_ends_where_profile_likelihood_drops() -> None:
 
 
 @pytest.mark.parametrize("sigma_a", [0.05, 0.5])
-def test_tune_on_exact_positions_gives_only_upper_noise_bound(sigma_a: float) -> None:
+def test_noise_fit_of_exact_positions_gives_only_upper_bound(sigma_a: float) -> None:
     found = tuned(modelled(3, 500, sigma_a=sigma_a, sigma_z=0.0))
     assert found.sigma_z.value is found.sigma_z.low is None
     assert SIGMA_Z_SEARCH_RANGE_M[0] <= found.sigma_z.high < 0.003
@@ -188,7 +188,7 @@ def test_noise_at_end_of_search_range_is_reported_as_bound() -> None:
     assert wild.sigma_z.low > 9.0
 
 
-def test_tune_with_too_few_measurements_is_unavailable() -> None:
+def test_noise_fit_of_too_few_measurements_is_unavailable() -> None:
     short = tune_axes("down", (modelled(1, MIN_MEASUREMENTS - 1),), TRUE)
     assert isinstance(short, Unavailable)
     assert short.what == "estimate of SIGMA_A and SIGMA_Z (down)"
@@ -199,7 +199,7 @@ def test_tune_with_too_few_measurements_is_unavailable() -> None:
     assert enough.sigma_z.low < SIGMA_Z < enough.sigma_z.high
 
 
-def test_tune_combines_axes_with_equal_timestamps() -> None:
+def test_noise_fit_combines_axes_with_equal_timestamps() -> None:
     north, east = modelled(1, 60), replace(modelled(2, 60), name="east")
     steps: list[str] = []
     found = tune((north, east), TRUE, progress=steps.append)
@@ -219,7 +219,7 @@ def horizontal(flight: Flight, *, imu: bool = True, drifts: bool = False) -> Axi
     return found
 
 
-def test_tune_separates_imu_bias_and_tilt_from_noise() -> None:
+def test_noise_fit_separates_imu_bias_and_tilt_from_noise() -> None:
     """KF has no states for biases and tilt, so its SIGMA_A is larger than the noise."""
     flight, _ = made_flight(3, offset_s=0.1)
     found, without = horizontal(flight), horizontal(flight, imu=False)
@@ -234,7 +234,7 @@ def test_tune_separates_imu_bias_and_tilt_from_noise() -> None:
 
 
 @pytest.mark.slow
-def test_sigma_a_estimate_is_unbiased_if_vehicle_moves_little() -> None:
+def test_acceleration_noise_estimate_at_slow_motion_is_unbiased() -> None:
     """A scale signal that contains the noise would explain part of it (errors in variables)."""
     ratios = [
         horizontal(made_flight(seed, moving=0.1, sigma_a=0.5)[0]).noises.sigma_a_m_s2 / 0.5
@@ -243,7 +243,7 @@ def test_sigma_a_estimate_is_unbiased_if_vehicle_moves_little() -> None:
     assert np.mean(ratios) == pytest.approx(1.0, abs=2.6 * np.std(ratios) / np.sqrt(len(ratios)))
 
 
-def test_tune_estimates_random_walk_of_drifting_source() -> None:
+def test_noise_fit_estimates_random_walk_of_drifting_source() -> None:
     """Add 0.1 m/√s, which would otherwise be estimated as acceleration noise."""
     flight, _ = made_flight(4, duration_s=90.0)
     track = flight.positions[0]

@@ -140,7 +140,7 @@ def test_read_ulog_joins_two_subscriptions_of_one_topic(order):
     np.testing.assert_allclose(read["x"], expected, rtol=1e-6)
 
 
-def test_logged_parameter_default_replaces_default_of_px4_table() -> None:
+def test_logged_parameter_default_overrides_px4_default() -> None:
     key = b"float EKF2_EV_DELAY"
     body = struct.pack("<BB", 1, len(key)) + key + struct.pack("<f", 175.0)
     message = struct.pack("<HB", len(body), ord("Q")) + body

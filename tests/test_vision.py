@@ -494,7 +494,7 @@ def model() -> Ekf2Model:
     return opened(flown())
 
 
-def test_ekf2_model_of_gnss_and_vision_agrees_with_log() -> None:
+def test_ekf2_replay_of_gnss_and_vision_agrees_with_log() -> None:
     agreement = model().agreement
     assert agreement.good
     assert agreement.doubtful == {}
@@ -507,7 +507,7 @@ def test_ekf2_model_of_gnss_and_vision_agrees_with_log() -> None:
     assert model().inputs.settings["EKF2_EVP_NOISE"] == pytest.approx(0.1)
 
 
-def test_what_if_with_vision_noise_equals_flight_with_this_noise() -> None:
+def test_replay_with_other_vision_noise_equals_flight_with_it() -> None:
     other = opened(flown(EKF2_EVP_NOISE=1.0))
     for one, value, then in ((model(), 1.0, other), (other, 0.1, model())):
         found, true = what_if(one, [{"EKF2_EVP_NOISE": value}]), what_if(then, [])
@@ -525,7 +525,7 @@ def test_what_if_with_vision_noise_equals_flight_with_this_noise() -> None:
     assert update_records.whatif[0].others == update_records.replayed.others
 
 
-def test_what_if_with_smaller_vision_gate_rejects_more() -> None:
+def test_ekf2_replay_with_smaller_vision_gate_rejects_more() -> None:
     request = WhatIfRequest(log="flight.ulg", changes={"EKF2_EVP_GATE": 1.0})
     made_of = run_what_if(request, flight=flown())
     found = made_of.statistics
@@ -537,7 +537,7 @@ def test_what_if_with_smaller_vision_gate_rejects_more() -> None:
     assert found.whatif[0].others["ev_pos"].rejected_fraction > 0.2
 
 
-def test_what_if_without_gnss_uses_vision() -> None:
+def test_ekf2_replay_without_gnss_uses_vision() -> None:
     without_vision = what_if(model(), [{}], {"ev_pos": 40.0})
     assert without_vision.whatif[0].others == {}
     lost = what_if(model(), [{}], dict.fromkeys(("gnss_pos", "gnss_vel"), 40.0))

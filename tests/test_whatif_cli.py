@@ -76,7 +76,7 @@ def test_whatif_command_without_vision_predicts_position_drift(sample_log: Path)
     assert "EKF2 stops publishing a position after EKF2_NOAID_TOUT (5 s)" in note
 
 
-def test_what_if_with_unknown_aiding_source_raises_error(estimated: WhatIfAnalysis) -> None:
+def test_ekf2_replay_rejects_removal_of_unknown_aiding_source(estimated: WhatIfAnalysis) -> None:
     model = prepare_ekf2_model(estimated.flight)
     for without, said in (
         (
@@ -89,7 +89,7 @@ def test_what_if_with_unknown_aiding_source_raises_error(estimated: WhatIfAnalys
             what_if(model, [], without)
 
 
-def test_what_if_without_set_option_proposes_no_needless_change(estimated: WhatIfAnalysis) -> None:
+def test_whatif_command_without_set_proposes_no_needless_change(estimated: WhatIfAnalysis) -> None:
     """The UWB noise is 0.10 m, as EKF2 assumes, and its timestamps are right."""
     assert estimated.uses_estimates
     assert not estimated.changes
@@ -103,7 +103,7 @@ def test_what_if_without_set_option_proposes_no_needless_change(estimated: WhatI
     assert not any("→" in line for line in lines)
 
 
-def test_whatif_sweep_also_applies_parameters_of_set_option(swept: WhatIfAnalysis) -> None:
+def test_whatif_command_sweep_also_applies_set_option_parameters(swept: WhatIfAnalysis) -> None:
     first, *values = swept.statistics.whatif
     assert dict(first.changed) == {"EKF2_EVP_GATE": 3.0}
     assert [v.changed["EKF2_EVP_NOISE"] for v in values] == pytest.approx([0.05, 0.1, 0.2])
@@ -118,7 +118,7 @@ def test_whatif_sweep_also_applies_parameters_of_set_option(swept: WhatIfAnalysi
     assert f"smallest at EKF2_EVP_NOISE {least.changed['EKF2_EVP_NOISE']:.3g}" in error
 
 
-def test_whatif_on_log_without_ekf2_states_raises_error(sample_log: Path) -> None:
+def test_whatif_command_on_log_without_ekf2_states_raises_error(sample_log: Path) -> None:
     with pytest.raises(MissingDataError, match="EKF2 replay: estimator_states is not logged"):
         run_what_if(WhatIfRequest(log=str(sample_log.with_suffix(".tlog"))))
 
@@ -131,7 +131,7 @@ class TestFlownFlights:
         log = shared_logs / "simulated" / f"{name}.ulg"
         return run_what_if(WhatIfRequest(log=str(log)))
 
-    def test_what_if_with_estimated_noise_has_no_rejections(self, shared_logs: Path) -> None:
+    def test_ekf2_replay_with_estimated_noise_has_no_rejections(self, shared_logs: Path) -> None:
         found = self.of(shared_logs, "v1.16.1_aisle_overconfident")
         assert set(found.changes) == {"EKF2_EVP_NOISE"}
         (cured,) = found.statistics.whatif
@@ -141,7 +141,7 @@ class TestFlownFlights:
         assert cured.position_rmse_to_truth_m < 0.4 * error(found.statistics.logged)
 
     @pytest.mark.parametrize("name", ["v1.16.1_aisle_clock_late", "v1.16.1_aisle_clock_nosync"])
-    def test_what_if_with_estimated_delay_restores_position_rmse(
+    def test_ekf2_replay_with_estimated_delay_restores_position_rmse(
         self, shared_logs: Path, name: str
     ) -> None:
         found = self.of(shared_logs, name)
@@ -151,7 +151,7 @@ class TestFlownFlights:
         assert error(cured) < 1.2 * error(clean) < 0.5 * error(found.statistics.logged)
         assert not any("would reach EKF2 after" in note for note in found.statistics.notes)
 
-    def test_what_if_recovers_true_delay_from_wrong_ekf2_delay(self, shared_logs: Path) -> None:
+    def test_whatif_command_finds_true_delay_from_wrong_ekf2_delay(self, shared_logs: Path) -> None:
         found = self.of(shared_logs, "v1.13.3_aisle_evdelay175")
         assert found.changes["EKF2_EV_DELAY"] == 0.0
         (cured,) = found.statistics.whatif
@@ -171,7 +171,7 @@ class TestFlownFlights:
             ("real/vladimireganov_ROS_PX4_MOCAP_square2", "EKF2 may have fused more samples"),
         ],
     )  # fmt: skip
-    def test_what_if_on_log_unsuitable_for_replay_raises_error(
+    def test_whatif_command_on_log_unsuited_to_replay_raises_error(
         self, shared_logs: Path, log: str, said: str
     ) -> None:
         with pytest.raises(MissingDataError, match=said):
@@ -186,7 +186,7 @@ def error(summary: Ekf2Statistics) -> float:
     return float(np.hypot(*parts))
 
 
-def test_what_if_table_omits_numbers_if_not_predictable(sample_flight: Flight) -> None:
+def test_whatif_command_omits_unpredictable_numbers(sample_flight: Flight) -> None:
     name, sweep = sample_flight.log.name, Sweep("EKF2_EVP_GATE", 1.0, 5.0, 2)
     request = WhatIfRequest(log=name, changes={"EKF2_EVP_NOISE": 0.02}, sweep=sweep)
     assert command_line(request).endswith("--set EKF2_EVP_NOISE=0.02 --sweep EKF2_EVP_GATE=1:5:2")
@@ -201,7 +201,7 @@ def test_what_if_table_omits_numbers_if_not_predictable(sample_flight: Flight) -
     assert "closest to 1" not in said
 
 
-def test_what_if_line_repeats_nis_band_only_if_bands_differ(swept: WhatIfAnalysis) -> None:
+def test_whatif_command_prints_expected_nis_range_if_it_differs(swept: WhatIfAnalysis) -> None:
     changed, *others = swept.statistics.whatif
     north = replace(
         changed.axes["north"],

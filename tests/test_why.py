@@ -56,7 +56,7 @@ def test_position_difference_on_report_page_is_kf_minus_ekf2(sample: Analysis) -
     )
 
 
-def test_kf_setting_is_a_part_of_kf_ekf2_position_difference(sample: Analysis) -> None:
+def test_kf_setting_contributes_to_kf_minus_ekf2_position(sample: Analysis) -> None:
     plain = of(sample)
     zero = explain_again(sample, Settings(input="zero"))
     assert zero.steps[0].name == SAMPLE_TIMES_PROPERTY_NAME
@@ -145,7 +145,7 @@ def test_kf_ekf2_difference_text_names_largest_contribution(sample, share, text)
     assert f" m (at {first.moved_at_s:.1f} s)" in explained.sentences[0]
 
 
-def test_report_on_kf_ekf2_difference_first_names_wrong_sigma_a(sample: Analysis) -> None:
+def test_wrong_kf_noise_is_first_in_report_on_kf_minus_ekf2(sample: Analysis) -> None:
     comparison = compare(sample.flight, Settings(sigma_a_m_s2=0.001), axes=("aisle",))
     corrected = find_corrected_noise_settings(comparison, sample.tuning)
     assert corrected == {"sigma_a_m_s2": pytest.approx(0.363, abs=0.01)}

@@ -73,7 +73,7 @@ def test_report_on_student_assignment_contains_no_diagnosis(assigned: Assigned) 
         "compare {log} --clock-offset auto",
     ],
 )
-def test_tune_sync_and_whatif_on_student_assignment_are_refused(
+def test_diagnosing_commands_on_student_assignment_are_refused(
     assigned: Assigned, command: str
 ) -> None:
     assert DIAGNOSIS_WITHHELD.reason in error_line(*command.format(log=assigned.log).split())

@@ -615,7 +615,7 @@ def _read_logged_decisions(
     for begin, end in (*fusion_to_log_rows, *dead_reckoning_rows):
         rejected_flags[begin : max(end - 1, 0)] = 1.0
     may_be_reset_sample = np.isnan(rejected_flags)
-    # 2. The log contains EKF2's decision (fused or rejected) on some of the samples
+    # The log contains EKF2's decision (fused or rejected) on some of the samples
     innovation_rows = find_matching_samples(innovations.index.to_numpy(), measurement_times_s)
     is_logged = innovation_rows >= 0
     innovations_of_samples = innovations.iloc[innovation_rows[is_logged]]
