@@ -325,7 +325,7 @@ def test_batch_log_changed_during_reading_is_reported_failed(flights, tmp_path, 
     monkeypatch.setattr(job, "_compare_log", grows)
     (row,) = analysed(log).rows
     assert (row["status"], row["log_sha256"]) == ("failed", before.sha256)
-    assert row["reason"] == "the file changed while it was read"
+    assert row["reason"] == "the log changed while it was read"
 
 
 @pytest.mark.usefixtures("remembered", "in_this_process")

@@ -16,6 +16,7 @@ from px4fuse.classroom.grading.model import Grade, GradedReport, ItemScore
 from px4fuse.classroom.grading.outputs import (
     TITLES_AFTER_ITEMS,
     TITLES_BEFORE_ITEMS,
+    _anonymise_grades,
     format_class_table,
 )
 from px4fuse.core.text import MAX_CELL_LENGTH, neutralise_formulas
@@ -158,3 +159,13 @@ def test_grades_csv_lists_late_and_missing_students() -> None:
     assert (
         len(neutralise_formulas("=" * 10**6)) <= MAX_CELL_LENGTH + 1
     )  # maximum length of a cell in Excel
+
+
+def test_new_student_gets_the_first_free_pseudonym(tmp_path) -> None:
+    names = tmp_path / "names.csv"
+    students = [Grade("", f"id{number}", None) for number in range(40)]
+    names.write_text(_anonymise_grades(students[:39], names)[1])
+    before = names.read_text()
+    grades, text = _anonymise_grades(students, names)
+    assert grades[39].student == "Student 040"
+    assert [line for line in text.splitlines() if "id39" not in line] == before.splitlines()

@@ -76,7 +76,7 @@ def read_column_name(name: str) -> ColumnMeaning:
     # 1. Unit: the last word, for example "m" in "pos_x_m"
     unit = _UNIT_BY_WORD.get(words[-1], "")
     if len(words) == 1:
-        # A unit alone, such as "sec", is a time. A letter alone, such as "s", is not a unit
+        # A unit alone, such as "sec", is a time. A short unit alone, such as "s" or "ms", is none
         if unit in SECONDS_BY_TIME_UNIT and len(words[0]) > 2:
             return ColumnMeaning("time", unit=unit, time_kind="time")
         unit = ""

@@ -166,8 +166,6 @@ def _estimate_receiver_interval(fix_times_s: Array) -> float | None:
     # Half or a third of the receiver's interval is possible too, so the longest interval is sought:
     # best fit among the candidates within 10 % of the longest possible interval
     longest_interval_s = CANDIDATE_FIX_INTERVALS_S[is_possible].max()
-    # Prefer long intervals: choose the candidate with the smallest deviation within 10 % of the
-    # longest possible interval
     is_near_longest = (
         np.abs(CANDIDATE_FIX_INTERVALS_S - longest_interval_s) < 0.1 * longest_interval_s
     )

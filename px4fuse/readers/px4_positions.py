@@ -325,8 +325,11 @@ def _make_track_from_ekf2_topics(
     """
     notes: tuple[str, ...] = ()
     if len(height_samples):
-        samples = join_nearest_samples(samples, height_samples, MAX_TIME_FROM_POSITION_TO_HEIGHT_S)
-        if missing_count := samples["down_m"].isna().sum():
+        # Before the first EKF2 state, position and height are NaN: such a height is not missing
+        samples = join_nearest_samples(
+            samples, height_samples.assign(_found=True), MAX_TIME_FROM_POSITION_TO_HEIGHT_S
+        )
+        if missing_count := samples.pop("_found").isna().sum():
             notes = (
                 f"{missing_count} of {len(samples)} external vision positions have no height "
                 f"within {1e3 * MAX_TIME_FROM_POSITION_TO_HEIGHT_S:.0f} ms and are used without "

@@ -22,7 +22,7 @@ AssociationMethod = Literal["interpolate", "nearest"]
 
 # Default maximum gap in the reference for interpolation, in median pose intervals
 MAX_GAP_IN_MEDIAN_INTERVALS = 3.0
-# A reference with a longer mean pose interval (s) is not interpolated
+# A reference with a longer median pose interval (s) is not interpolated
 MIN_POSE_INTERVAL_LIMIT_S = 2.0
 # Lower limit (s) of the default maximum gap for interpolation
 MIN_GAP_LIMIT_S = 0.1

@@ -182,9 +182,9 @@ class Evaluation(Record, kw_only=True):
         Transform from the frame of the estimate to the frame of the reference.
     time_offset : TimeOffset
         Time offset added to the timestamps of the estimate.
-    ate : AbsoluteError
+    ate : AbsoluteTrajectoryError
         Absolute trajectory error.
-    rpe : tuple of RelativeError
+    rpe : tuple of RelativePoseError
         Relative pose errors.
     notes, warnings : tuple of str
         Sentences for the user.

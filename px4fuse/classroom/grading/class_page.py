@@ -160,7 +160,6 @@ def _make_grade_details(grade: Grade) -> Iterator[RowDetailsSection]:
         yield frame.make_list_section("Missing", ["No submission."])
         return
     verification = report.verification
-
     items = [
         (
             item.title,

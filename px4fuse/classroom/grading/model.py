@@ -87,7 +87,7 @@ class GradedReport:
     ----------
     submission : str
         Name of the submission in messages.
-    origin : ExportOrigin
+    origin : SubmissionOrigin
         Student and submission time from the learning platform.
     student, student_id : str
         Name and id in the report.

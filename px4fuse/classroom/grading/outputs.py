@@ -205,7 +205,7 @@ def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade],
     # students keep their pseudonyms; new students get the free ones in random order
     free_pseudonyms = [
         pseudonym
-        for number in range(1, len(name_by_identity) + len(pseudonym_by_identity) + 1)
+        for number in range(1, len(name_by_identity | pseudonym_by_identity) + 1)
         if (pseudonym := f"Student {number:03}") not in pseudonym_by_identity.values()
     ]
     new_identities = [each for each in name_by_identity if each not in pseudonym_by_identity]

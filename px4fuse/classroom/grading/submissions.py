@@ -176,8 +176,6 @@ def add_submitters(
         if platform := parse_submission_path(submission.name).platform:
             platform_counts_by_export[export][platform] += 1
     for export, submission in zip(export_locations, submissions, strict=True):
-        # all files of an export are from one learning platform: assume the platform of most file
-        # names, because students may imitate file names of another platform
         most_common = platform_counts_by_export[export].most_common(1)
         origin = parse_submission_path(submission.name, [platform for platform, _ in most_common])
         if origin.platform in ("gradescope", ""):
@@ -359,7 +357,7 @@ def parse_submission_path(
     {'canvas': '12345'}
     >>> parse_submission_path("Lab 3_jdoe_attempt_2026-11-20-12-34-56_report.pdf").time
     datetime.datetime(2026, 11, 20, 12, 34, 56)
-    >>> parse_submission_path("report.pdf") == ExportOrigin()
+    >>> parse_submission_path("report.pdf") == SubmissionOrigin()
     True
     """
     for platform, match in _match_platforms(name, platforms):
