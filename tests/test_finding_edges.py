@@ -926,13 +926,6 @@ def test_gap_above_5_intervals_is_not_counted_as_lost_samples() -> None:
         assert [each.evidence["lost"] for each in source_intervals.detect_lost_samples(one)] == lost
 
 
-def test_evidence_of_correlated_errors_keeps_its_names() -> None:
-    slow_error = analysis(time_correlated_noise=slow(99.0, 0.0))
-    found = only(source_errors.detect_time_correlated_noise, slow_error)
-    assert (found.evidence["gain_nats"], found.evidence["low_pass_gain_nats"]) == (99.0, 0.0)
-    assert only(source_positions.detect_low_pass, low_pass(9.0, 0.1)).evidence["gain_nats"] == 9.0
-
-
 def test_report_on_position_jumps_states_count_and_largest_jump() -> None:
     sizes = (jump(0.3, 0.0, at_s=30.0), jump(0.6, 0.8, at_s=60.0), jump(0.1, 0.0, at_s=90.0))
     finding = only(source_positions.detect_jumps, jumping(*sizes))
