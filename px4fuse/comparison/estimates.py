@@ -80,7 +80,7 @@ class Estimates:
         Yaw misalignment of the position frame.
     axis_tunings : tuple of AxisTuning
         Noises along two perpendicular axes, if they differ.
-    noisy_flight_part : NoisyPart or None
+    noisy_flight_part : NoisyFlightPart or None
         Time span with larger innovations than in the rest of the flight.
     imu_oscillation : ImuOscillation or None
         Oscillation of the accelerometer that the positions do not contain.

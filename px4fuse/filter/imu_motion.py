@@ -351,7 +351,7 @@ def compute_imu_motion(
     ----------
     time_s, measurement_m : ndarray, shape (m,) and (m, a)
         Positions (m) and their times.
-    directions, dt_s, measurement_weights, heading_sigma_rad
+    axis_directions, dt_s, measurement_weights, heading_sigma_rad
         See :class:`PositionsAndImuMotion`; weights are 1 by default.
     motion_cache : dict, optional
         IMU motion that is already computed; new motion is added.
