@@ -53,6 +53,7 @@ def parse_landing(text: str) -> Landing:
 
 def parse_closure(text: str) -> GivenClosure:
     """Parse a loop closure: ``T1,T2`` (s) or ``T1,T2,SIGMA`` (m)."""
+    # the limit on the magnitude is the largest float, which excludes only infinity
     return GivenClosure(
         *_parse_numbers(
             text, "T1,T2 (times at the same place, s) or T1,T2,SIGMA (σ in m)", sys.float_info.max
@@ -187,6 +188,8 @@ def loop(
 
 
 def make_loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
+    """Make the request from the options of the command; ``option_values`` is changed."""
+    # robust concerns only pose graphs in g2o files
     del option_values["robust"]
     return LoopRequest(
         source=str(source), closed_loop=not option_values.pop("is_open_path"), **option_values

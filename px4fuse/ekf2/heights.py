@@ -266,11 +266,13 @@ class HeightFilter:
         )
 
     def fuse_barometer(self, event: int, x: Array, P: Array) -> ArrayPair:
+        """Fuse the barometer samples of an event, which are stored before the GNSS sample."""
         for sample_index in range(self.gnss_index):
             x, P = self._fuse_sample(BAROMETER, event, sample_index, x, P, self.R_m2)
         return x, P
 
     def fuse_gnss(self, event: int, x: Array, P: Array, R: Array) -> ArrayPair:
+        """Fuse the GNSS height of an event with its variance R (m²)."""
         return self._fuse_sample(GNSS_HGT, event, self.gnss_index, x, P, R)
 
     def update_bad_acceleration_flag(

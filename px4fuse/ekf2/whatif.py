@@ -580,7 +580,8 @@ def _compute_heading_error_deg(
     flight: Flight, replay: Ekf2Replay, headings_rad: pd.Series, spans_s: Spans
 ) -> float | Unavailable:
     """Return the mean (°) of ``headings_rad`` minus true heading."""
-    # If EKF2 fuses vision without GNSS, the replay uses EKF2's logged heading
+    # Only a replay with GNSS estimates the heading; its settings contain the GNSS noise. A replay
+    # with vision alone uses EKF2's logged heading
     if GNSS_POS.noise not in replay.settings:
         return HEADING_NOT_REPLAYED
     true_attitude = None if isinstance(flight.truth, Unavailable) else flight.truth.attitude

@@ -163,6 +163,11 @@ def split_track(source: str) -> tuple[str, str]:
 def _repeat_comparison(
     submitted_results: ComparisonResults, link_input_file: _LinkInputFile
 ) -> tuple[object, ReportedResults]:
+    """Repeat the analysis of a report of ``px4fuse compare``.
+
+    The analysis reads the linked files, which ``link_input_file`` finds by their hash. The results
+    contain the paths of the report.
+    """
     from px4fuse.diagnose import diagnose  # noqa: PLC0415
     from px4fuse.results.build import make_comparison_results  # noqa: PLC0415
 
@@ -187,6 +192,7 @@ def _repeat_comparison(
 def _repeat_loop_analysis(
     submitted_results: LoopResults, link_input_file: _LinkInputFile
 ) -> tuple[object, ReportedResults]:
+    """Repeat the analysis of a report of ``px4fuse loop``; see :func:`_repeat_comparison`."""
     from px4fuse.diagnose import analyse_loop_closure  # noqa: PLC0415
     from px4fuse.results.build import make_loop_results  # noqa: PLC0415
 
@@ -196,6 +202,7 @@ def _repeat_loop_analysis(
     request = replace(recorded_request, source=link_path + track)
     if recorded_request.reference is not None:
         path, track = split_track(recorded_request.reference)
+        # The reference given by the user is the last, after ground truth in the log
         sha256 = submitted_results.references[-1].sha256 if submitted_results.references else None
         request = replace(request, reference=link_input_file(path, sha256, "--reference") + track)
     analysis = analyse_loop_closure(request)
