@@ -22,7 +22,12 @@ from px4fuse.card.model import (
     map_ratio_to_axis,
 )
 from px4fuse.comparison.model import FILTER_NAMES
-from px4fuse.core.text import convert_nested, format_metres, format_ratio
+from px4fuse.core.text import (
+    capitalise_first_letter,
+    convert_nested,
+    format_metres,
+    format_ratio,
+)
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS, Reference
 from px4fuse.finding import MAX_LISTED_SPANS, format_spans
 from px4fuse.request import quote_command
@@ -290,7 +295,7 @@ def make_headline(card: DiagnosisCard) -> Paragraph:
 
 def _format_cause_lines(cause: DiagnosedCause, do_this: str) -> Iterator[Paragraph]:
     is_shortened = len(cause.spans_s) > MAX_LISTED_SPANS
-    times_text = " (all times: spans_s in the JSON results)" * is_shortened
+    times_text = " (all times are in spans_s of the JSON results)" * is_shortened
     yield _make_labelled_paragraph("when", format_spans(cause.spans_s) + times_text)
     # ``do_this`` is already printed above the causes. Omit an action if ``do_this`` contains its
     # sentence, unless the action is an alternative (": " in the label) or has commands. The first
@@ -334,9 +339,11 @@ def _format_action_lines(label: str, label_width: int, action: Action) -> Iterat
 def _format_rerun_lines(reruns: Sequence[CardRerun]) -> Iterator[Paragraph]:
     headings, *rows = make_rerun_rows(reruns) or [[]]
     for label, *values, result in rows:
-        named_values = zip(headings[1:], values, strict=False)  # the last heading is that of result
-        texts = [f"{heading} {value}" for heading, value in named_values if value]
-        yield _make_labelled_paragraph("re-run", f"{label}: {', '.join([*texts, result])}")
+        # the last heading is that of result
+        named_values = zip(headings[1:], values, strict=False)
+        texts = [f"{heading.lstrip('●◆ ')} {value}" for heading, value in named_values if value]
+        values_text = capitalise_first_letter(", ".join(texts))
+        yield _make_labelled_paragraph("re-run", f"{label}: {result}. {values_text}")
     yield Paragraph(format_rerun_note(reruns), "  ", "  ")
 
 
@@ -399,7 +406,7 @@ def _format_verdict_lines(card: DiagnosisCard) -> Iterator[Paragraph]:
     )
     yield Paragraph(f"{legend:{SIGMA_RATIO_AXIS_INDENT}}", plot=_format_tick_labels())
     if any(verdict.is_explained for verdict in card.verdicts):
-        yield Paragraph("  Verdicts in brackets need no action.")
+        yield Paragraph("  A verdict in brackets, such as (overconfident), needs no action.")
     yield from map(_format_verdict_line, card.verdicts)
 
 
