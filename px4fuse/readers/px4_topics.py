@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import msgspec
+from msgspec import structs
 
 from px4fuse.core.record import read_toml
 from px4fuse.flight.ekf2_parameters import AIDS
@@ -25,6 +26,8 @@ class TrackSource:
     # Advice if the positions of this source are not logged
     remedy: str
     kind: str = "uwb"
+    # False if EKF2 never fuses these positions
+    fused: bool = True
     # Coordinate frame of the positions; if "unknown", the topic may contain it
     frame: str = "unknown"
     # Names of the possible topic definitions in ``px4_topics.toml``, preferred first
@@ -32,7 +35,8 @@ class TrackSource:
 
     @property
     def origin(self) -> SourceOrigin:
-        return find_source_origin(self.kind, self.route)
+        origin = find_source_origin(self.kind, self.route)
+        return origin if self.fused else structs.replace(origin, aid=None)
 
 
 _TOPIC_TABLES = read_toml(__file__, dict[str, dict[str, Any]])
