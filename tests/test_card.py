@@ -14,12 +14,14 @@ from exchange import replace
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import (
     _describe_kf_settings,
+    _explain_verdict_differences,
     _format_actions,
     build_card,
     build_unusable_log_card,
 )
 from px4fuse.card.causes import _find_action_target, make_cause, rank_causes
-from px4fuse.card.model import Action, DiagnosedCause, Note
+from px4fuse.card.model import Action, DiagnosedCause, Note, Verdict
+from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.comparison.rerun_effects import Rerun, RunStatistics, classify_improvement
 from px4fuse.diagnose import diagnose_comparison
 from px4fuse.errors import LogError
@@ -156,6 +158,23 @@ def test_diagnosis_merges_equal_actions_for_kf_and_ekf2() -> None:
     assert [(action.target, action.sentence) for action in cause.actions] == [
         ("sender", "Check the link."), ("KF, EKF2", "no filter setting corrects this fault"),
     ]  # fmt: skip
+
+
+def test_position_lag_explains_ekf2_verdict_at_any_place() -> None:
+    errors = ErrorsAgainstTruth(count=9, position_rmse_m=0.1, nees_position_horizon_mean=1.0)
+    flown: Any = SimpleNamespace(
+        source=SimpleNamespace(origin=AS_RECEIVED_ORIGIN),
+        main=SimpleNamespace(filters={"ekf2": SimpleNamespace(truth=errors)}),
+    )
+    names: Any = (("ekf2", "source"), ("ekf2", "truth"), ("kf", "truth"))
+    given = tuple(
+        Verdict(filter=name, against=against, ratio=2.0, word="overconfident")
+        for name, against in names
+    )
+    marked, _ = _explain_verdict_differences(flown, given, ())
+    assert [(each.filter, each.against) for each in marked if each.is_explained] == [
+        ("ekf2", "truth")
+    ]
 
 
 def test_diagnosis_without_ground_truth_is_reported_as_untested() -> None:

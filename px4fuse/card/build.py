@@ -480,8 +480,9 @@ def _explain_verdict_differences(
     """
     may_drift, ekf2_errors = analysis.source.origin.may_drift, analysis.main.filters["ekf2"].truth
     sigma_verdicts = _mark_explained_verdicts(sigma_verdicts, causes, may_drift=may_drift)
-    # The last verdict is that on EKF2 against ground truth
-    *other_verdicts, ekf2_verdict = sigma_verdicts
+    ekf2_verdict = next(
+        each for each in sigma_verdicts if (each.filter, each.against) == ("ekf2", "truth")
+    )
     # EKF2 reports σ for its position at the fusion horizon, not for the published position. If no
     # fault is known and the error at the fusion horizon agrees with σ, EKF2 is consistent
     if (
@@ -492,7 +493,11 @@ def _explain_verdict_differences(
     ):
         horizon_sigma_ratio = math.sqrt(ekf2_errors.nees_position_horizon_mean)
         if classify_sigma_ratio(horizon_sigma_ratio, "truth") == "consistent":
-            return (*other_verdicts, replace(ekf2_verdict, is_explained=True)), (
+            sigma_verdicts = tuple(
+                replace(each, is_explained=True) if each is ekf2_verdict else each
+                for each in sigma_verdicts
+            )
+            return sigma_verdicts, (
                 "EKF2 reports σ for its delayed position at the fusion horizon. The error of the "
                 f"delayed position is {format_ratio(horizon_sigma_ratio)} times σ, so EKF2 is "
                 "consistent. The output predictor adds a lag error to the published position."
