@@ -325,7 +325,7 @@ def test_loop_without_ground_truth_assumes_landing_at_take_off(
     assert find_loop_findings(analyse_loop(sample, landed_at=Landing(0.0, 0.0))) == ()
 
 
-def test_loop_command_finds_orientation_fault_as_compare_does(
+def test_loop_and_compare_report_the_same_orientation_fault(
     sample: LoopSource, monkeypatch: Any
 ) -> None:
     track = next(one for one in sample.flight.positions if one.orientation is not None)

@@ -231,7 +231,9 @@ def fit_by_least_squares(
     is_fitted = np.array([True, True, is_lag_estimated, yaw_rad is None])
 
     def compute_residuals_m(fitted_parameters: Array) -> Array:
-        """Return aligned file position minus reference position (m), north and east in turn.
+        """Return the aligned positions of the file minus the reference positions (m).
+
+        The result contains north and east of the first position, then of the second, and so on.
 
         ``fitted_parameters`` are trial values of the parameters in ``is_fitted``.
         """

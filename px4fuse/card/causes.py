@@ -221,9 +221,9 @@ def _make_actions(
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
     """Return the actions against a cause: alternative groups of actions, and further actions.
 
-    The user takes all actions of one group, and all further actions. If re-runs with corrected
-    timestamps and with another delay parameter both help, the groups are the correction of the
-    sender, and that of the delay parameter.
+    The fault is corrected by all actions of one group together with the further actions. There are
+    two groups if a re-run with corrected timestamps and one with another delay parameter both help:
+    correct the sender, or set the delay parameter.
     """
     finding = ranked_cause.finding
     rerun_by_filter_and_kind = {(rerun.filter, rerun.kinds[0]): rerun for rerun in useful_reruns}

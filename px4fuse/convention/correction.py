@@ -124,7 +124,7 @@ def find_convention_faults(
     # - EKF2 did not fuse the source, and only the heading from the gyroscopes is available. It
     #   drifts, so it shows wrong axes (multiples of 90°), but not a rotation
     has_no_heading_reference = uses_gyro_heading and not is_fused and not has_wrong_axes
-    # - An FRD frame has no fixed rotation from north
+    # - The frame of the positions is FRD, which has no fixed rotation from north
     if has_wrong_heading or is_heading_from_source or has_no_heading_reference or frame == "FRD":
         rotation_deg = 0.0
     faults = ConventionFaults(

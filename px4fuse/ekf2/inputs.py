@@ -634,7 +634,7 @@ def _read_logged_decisions(
         reset_rows = np.flatnonzero(is_published_near_reset & may_be_reset_sample)
         rows_after_dead_reckoning = np.intersect1d(reset_rows, dead_reckoning_rows[:, 1] - 1)
         # If a possible reset sample ended dead reckoning, EKF2 reset its position to it. Otherwise,
-        # the reset is to the newest possible sample
+        # EKF2 reset its position to the newest possible sample
         if len(rows_after_dead_reckoning):
             is_reset[rows_after_dead_reckoning[0]] = True
         elif len(reset_rows):

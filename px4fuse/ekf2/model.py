@@ -508,8 +508,8 @@ def _make_state_tracks(
     # Number of prediction steps from the fusion horizon to the present, over which the output
     # predictor extrapolates
     lag_steps = max(round(horizon_s / inputs.mean_step_s), 1)
-    # If attitude is not a state of the filter configuration, EKF2's published attitude is used
-    # without a correction
+    # A filter configuration without attitude states uses EKF2's published attitude without a
+    # correction
     attitude_correction_rad = np.zeros((len(state), 3))
     if configuration.estimates_attitude:
         attitude_correction_rad = sum_attitude_corrections(

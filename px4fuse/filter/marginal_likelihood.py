@@ -675,8 +675,8 @@ def factorise(
         rho = np.where(is_within_segment, np.exp(-interval_s / tau_s), 0.0)
         # Gauss-Markov process: variance σ_c² at the start of a segment, driving noise (1 - ρ²) σ_c²
         correlated_noise_step_variance_m2 = correlated_sigma_m**2 * np.append(1.0, 1.0 - rho**2)
-        # A measurement is the sum of position and correlated noise. Its precision is therefore in
-        # the diagonal elements of both states, and in the off-diagonal element that couples them
+        # A measurement is the sum of position and correlated noise. Its precision is therefore
+        # added to the diagonal elements of both states, and is their off-diagonal element
         correlated_noise_bands = band_storage[:, 2]
         position_bands[:, 2] = position_measurement_precision
         correlated_noise_bands[:, 0] = (

@@ -31,7 +31,8 @@ from .recording import DEFAULT_SDLOG_PROFILE, VISION_PROFILE_MASK
 
 # Maximum specific force (m/s²) of real sensors: 35 g, because the largest range is 32 g
 MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2 = 343.0
-# Minimum number of samples above MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2, for a finding
+# Specific forces above MAX_PLAUSIBLE_SPECIFIC_FORCE_M_S2 are reported if they occur in at least
+# this number of samples
 MIN_IMPLAUSIBLE_FORCE_SAMPLES = 3
 # Minimum accelerometer bias (m/s²) for severity "error"; it causes an error of 0.15 m in 1 s
 MIN_SEVERE_BIAS_M_S2 = 0.3

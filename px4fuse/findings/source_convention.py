@@ -80,8 +80,8 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
         item for item in findings if FINDING_CATALOGUE[item.id].report_class == "unusable"
     ]
     if unusable_positions:
-        # A convention found with unusable positions is not valid. But a lever arm does not change
-        # the heading of the orientation
+        # Axes, unit and clock that were estimated from unusable positions are not valid. Exception:
+        # a wrong lever arm does not change the orientation, so its finding remains
         is_only_lever_arm = {item.id for item in unusable_positions} == {"source_lever_arm"}
         causes = [
             item for item in causes if is_only_lever_arm and item.id == "source_orientation_wrong"

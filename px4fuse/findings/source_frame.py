@@ -151,8 +151,8 @@ def _truth_contradicts_heading_drift(flight: Flight, heading_error: HeadingError
         or isinstance(attitude, Unavailable)
     ):
         return False
-    errors_rad, parts = [], heading_error.find_extreme_parts()
-    for part in parts:
+    errors_rad, flight_parts = [], heading_error.find_extreme_parts()
+    for part in flight_parts:
         samples = rows_between(attitude, part.start_s, part.end_s)[Columns.QUATERNION]
         true_attitude = interpolate(
             samples.index.to_numpy(), truth.attitude.index.to_numpy(), truth.attitude.to_numpy()
@@ -160,7 +160,7 @@ def _truth_contradicts_heading_drift(flight: Flight, heading_error: HeadingError
         error_rad = heading_of(samples.to_numpy()) - heading_of(true_attitude)
         errors_rad.append(np.median(np.arctan2(np.sin(error_rad), np.cos(error_rad))))
     true_drift_deg = np.degrees(np.ptp(errors_rad))
-    estimated_drift_deg = np.ptp([part.heading_error_deg for part in parts])
+    estimated_drift_deg = np.ptp([part.heading_error_deg for part in flight_parts])
     return bool(true_drift_deg < MIN_TRUE_TO_ESTIMATED_HEADING_DRIFT_RATIO * estimated_drift_deg)
 
 

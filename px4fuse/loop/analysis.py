@@ -76,7 +76,7 @@ def analyse(
         for time_s in (request.start_s, request.end_s)
     )
     segment = loop_segment.choose_loop_segment(flight, trajectory, start_s, end_s)
-    # 1. True final pose, and loop closures
+    # Find the true final pose and the loop closures
     truth = None
     if flight is not None and trajectory.kind != "truth":
         with suppress(MissingDataError):
@@ -100,7 +100,7 @@ def analyse(
         )
         _require_valid_closure(closure, path)
         closures.append(closure)
-    # 2. Pose graph with the key frames as nodes, and its solutions
+    # Make a pose graph with the key frames as nodes, and solve it
     key_frame_spacing_m = request.key_frames_m
     if key_frame_spacing_m is None:
         key_frame_spacing_m = compute_default_key_frame_spacing_m(path.position_m)
@@ -114,7 +114,7 @@ def analyse(
     pose_graph_corrections, tested_closures = solve_pose_graphs(
         path, node_indices, graph, closures, true_end, progress
     )
-    # 3. Closure errors, and their distribution along the path
+    # Compute the closure errors, and distribute them along the path
     displacement_m = path.position_m[-1] - path.position_m[0]
     odometry_heading_change_deg = loop_segment.compute_heading_change_deg(path)
     closure_error_vector_m: Array | Unavailable
@@ -130,7 +130,7 @@ def analyse(
     paths_with_distributed_closure_error = distribute_closure_error_by_distance(
         path, distance_m, closure_error_vector_m, heading_error_deg, tested_closures
     )
-    # 4. ATE and RPE of all paths
+    # Compute ATE and RPE of all paths
     references = tuple(track for track in (truth, reference) if track is not None)
     return Loop(
         track=path.name,

@@ -361,15 +361,15 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
     analysed_frame_slice = slice(0, len(frames))
     restart_rows = _find_restarts(boot_times_s)
     if len(restart_rows):
-        parts = np.split(np.arange(len(rows)), restart_rows)
-        longest_part = max(parts, key=len)
+        rows_by_part = np.split(np.arange(len(rows)), restart_rows)
+        longest_part = max(rows_by_part, key=len)
         longest_part_fraction = len(longest_part) / len(rows)
         rows, boot_times_s = rows[longest_part], boot_times_s[longest_part]
         # `rows` are the frames that contain a boot time. If the longest part is the first (last)
         # one, it also contains all frames before the first (after the last) boot time
         analysed_frame_slice = slice(
-            0 if longest_part is parts[0] else int(rows[0]),
-            len(frames) if longest_part is parts[-1] else int(rows[-1]) + 1,
+            0 if longest_part is rows_by_part[0] else int(rows[0]),
+            len(frames) if longest_part is rows_by_part[-1] else int(rows[-1]) + 1,
         )
         notes.append(
             f"number of restarts of the boot clock: {len(restart_rows)}. Only the longest part "

@@ -330,7 +330,7 @@ def analyse_graph(
         The graph is not connected.
     """
     closure_edges = np.flatnonzero(~graph.find_successive_edges())
-    # 1. Solve with all closures, and test the fit: reduced χ² with its expected 95 % interval
+    # Solve with all closures, and test the fit: reduced χ² with its expected 95 % interval
     progress(f"optimising: {SOLUTION_LABELS['all']}")
     solutions = {"all": solve(graph)}
     degrees_of_freedom = int(model.count_observed_directions(graph.information).sum())
@@ -341,7 +341,7 @@ def analyse_graph(
         reduced_chi2_interval = tuple(
             (chdtri(degrees_of_freedom, [0.975, 0.025]) / degrees_of_freedom).tolist()
         )
-    # 2. Test each closure against odometry
+    # Test if each closure agrees with odometry
     scaled_graph, information_factor = graph, 1.0
     closure_tests: tuple[GateResult, ...] | Unavailable
     try:
@@ -363,7 +363,7 @@ def analyse_graph(
         closure_tests = Unavailable(
             "gate", str(error), "Give an odometry edge between all successive vertices."
         )
-    # 3. Solve again without false closures
+    # Solve again without false closures
     if use_robust_optimisation is None:
         use_robust_optimisation = len(closure_edges) <= MAX_GNC_CLOSURES
     if use_robust_optimisation and len(closure_edges) > 1:
