@@ -167,6 +167,7 @@ def table(analysis: Analysis) -> pd.DataFrame:
 
 
 def _make_summary_row(summary: FilterSummary | UntestedFilter) -> dict[str, Any]:
+    """Return the row of :func:`table` for one filter; verdict "" and count None without a test."""
     truth = {} if isinstance(summary.truth, Unavailable) else structs.asdict(summary.truth)
     row = {"verdict": "", **truth, "count": None, **structs.asdict(summary)}
     row["nis_low"], row["nis_high"] = row.get("nis_band", (None, None))
@@ -255,8 +256,8 @@ def close_loop(
     TrajectoryError, LogError, MissingDataError, SettingsError
         A file cannot be read or lacks required data, or a number is out of range.
     """
-    # The request does not contain the argument ``reference``, which may be a Trajectory instead of
-    # a file name: :func:`analyse` has its own argument for the reference
+    # ``reference`` may be a Trajectory instead of a file name. Therefore :func:`analyse` gets it as
+    # an argument, and LoopRequest does not contain it
     loop_request = request.LoopRequest(
         source=str(source),
         frame=frame,
@@ -321,12 +322,14 @@ def write_page(analysis: Analysis, path: Pathlike) -> Path:
 
 @display_html.register
 def _display_card(analysis: Analysis) -> str | None:
+    """Return the diagnosis card for Jupyter notebooks (HTML); None without a request."""
     from .report.card_html import make_diagnosis_card, make_notebook_html  # noqa: PLC0415 - slow import
 
     return None if analysis.request is None else make_notebook_html(make_diagnosis_card(analysis))
 
 
 def _require_suffix(path: Pathlike, suffix: str) -> Path:
+    """Return a path; raise OutputError if its name does not end in ``suffix`` (such as ".pdf")."""
     output_path = Path(path)
     if output_path.suffix.lower() != suffix:
         raise OutputError(f"{output_path}: the name of the file must end in {suffix}.")

@@ -8,7 +8,7 @@
 4. diagnose_comparison, which calls:
 
    a. estimate: noise σ, time offset, frame misalignment, biases
-   b. refine_delay: report the negative time offset from a as delay of the positions
+   b. refine_delay: report the time offset of step 4a, with opposite sign, as position delay
    c. rerun: replay EKF2, explain KF - EKF2, re-run both filters with one change at a time
    d. collect_events, evaluate_aids, analyse_flight_loop: events, EKF2's other aiding sources,
       loop closure error
@@ -109,6 +109,7 @@ def diagnose(
 
 
 def _diagnose_flight(request: ComparisonRequest, progress: Progress, flight: Flight) -> Analysis:
+    """Compare KF with EKF2 on a flight, and find faults: steps 2 to 4 of :func:`diagnose`."""
     prepared_comparison = prepare_comparison(flight, request, progress)
     progress("running KF")
     comparison = compare(prepared_comparison)

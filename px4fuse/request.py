@@ -365,6 +365,7 @@ def _list_changed_options(request: msgspec.Struct) -> Iterator[tuple[str, str | 
 
 
 def _format_value(value: Any) -> str:
+    """Format a value as on the command line: parts with commas between them, None omitted."""
     if isinstance(value, msgspec.Struct):
         value = msgspec.structs.astuple(value)
     if isinstance(value, tuple):

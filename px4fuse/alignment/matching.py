@@ -156,8 +156,8 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> TrackMatch | None:
             # accurate enough for such a check
             if not missing_options:
                 return None
-            # The IMU determines the parameters less accurately than EKF2's position, so it cannot
-            # resolve an ambiguity
+            # Several time offsets or frames fit equally well. From the IMU, time offset and frame
+            # are less accurate than from EKF2's position, so the IMU cannot resolve an ambiguity
             if isinstance(error, AmbiguousMatchError):
                 raise
             reasons.append(error.reason)
@@ -232,6 +232,7 @@ def needs_rotation(
 
 
 def is_reliable_fit(fit: TrackFit, reference: str) -> bool:
+    """Return True if the correlation is high and no second time offset fits equally well."""
     return (
         fit.concordance_correlation >= MIN_CONCORDANCE_CORRELATION_WITHOUT_WARNING[reference]
         and fit.second_to_best_residual_ratio >= MIN_SECOND_BEST_RESIDUAL_RATIO
@@ -239,6 +240,7 @@ def is_reliable_fit(fit: TrackFit, reference: str) -> bool:
 
 
 def _require_unique_match(match: TrackMatch) -> None:
+    """Raise an error if a match is poor (NoMatchError) or ambiguous (AmbiguousMatchError)."""
     reference_name = match.reference.name
     fit = match.time_offset_fit
     min_correlation = MIN_CONCORDANCE_CORRELATION_TO_ACCEPT_MATCH[reference_name]
@@ -281,7 +283,8 @@ def _refit_without_origin_resets(
     """Repeat the fit to EKF2's position without resets that only moved its origin.
 
     The first fit aligns the position file with EKF2. The aligned positions then show at which
-    resets only the origin of EKF2's frame moved.
+    resets only the origin of EKF2's frame moved. A match with the IMU, or a flight without resets,
+    is returned unchanged.
     """
     ekf2, first_fit = flight.ekf2, match.time_offset_fit
     if match.reference.name == IMU_REFERENCE or isinstance(ekf2, Unavailable) or not ekf2.resets:

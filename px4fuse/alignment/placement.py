@@ -247,6 +247,7 @@ def _add_track(
 def _check_options(
     frame: str | None, yaw_deg: float | str | None, clock_offset_s: float | None
 ) -> None:
+    """Raise SettingsError if an option of :func:`align_position_file` is invalid."""
     if frame not in (None, *NED_COMPONENTS_BY_FRAME):
         raise SettingsError(
             f"`frame` {frame} is not a known coordinate frame.",
@@ -265,6 +266,7 @@ def _explain_frame(
     problem: AlignmentProblem,
     match: TrackMatch | None,
 ) -> str:
+    """Explain in a text for the report how the frame of the file was found."""
     if given_frame:
         return "the frame was given with --position-frame"
     if match and len(problem.frames) != 1:
@@ -297,7 +299,8 @@ def _apply_alignment(
     boot_time_s, is_yaw_estimated = flight.log.boot_time_s, problem.yaw_rad is None
     frame = match.frame if match else problem.frames[0]
     reference_name = match.reference.name if match else ""
-    # Values of the user. Those that the user did not give are replaced by those of the match
+    # Start with the known values, or 0 for values to be estimated. The match replaces the latter
+    # below
     yaw_rad, lag_s, origin_m = problem.yaw_rad or 0.0, problem.lag_s or 0.0, np.zeros(3)
     yaw_sigma_deg = time_offset_sigma_s = correlation_with_reference = residual_rms_m = None
     if match and is_yaw_estimated:
@@ -434,6 +437,7 @@ def _find_frame_conflict(
 
 
 def _find_match_warnings(match: TrackMatch, is_yaw_estimated: bool) -> Iterator[str]:
+    """Yield warnings about an uncertain match of the position file."""
     reference_name = match.reference.name
     fit = match.time_offset_fit
     if fit.concordance_correlation < MIN_CONCORDANCE_CORRELATION_WITHOUT_WARNING[reference_name]:

@@ -218,9 +218,9 @@ def fit_by_least_squares(
     )
     sigma_product_m2 = np.sqrt(file_position_variance_m2 * reference_position_variance_m2)
     covariance_m2 = np.vdot(file_position_m, reference_position_m) / len(file_position_m)
-    # The complex correlation coefficient (coherence) of file and reference has the yaw as its
-    # phase. Its magnitude does not depend on a scale factor between them. The concordance
-    # correlation coefficient (below) decreases with such a factor
+    # Positions are complex numbers north + i·east, so the phase of their correlation coefficient
+    # (coherence) is the yaw. Its magnitude does not depend on a scale factor between file and
+    # reference, unlike the concordance correlation coefficient below
     coherence = complex(covariance_m2 / sigma_product_m2) if sigma_product_m2 > 0.0 else 0j
     reference_horizontal_position_m = reference.to_complex_m()
 
@@ -233,9 +233,9 @@ def fit_by_least_squares(
     def compute_residuals_m(fitted_parameters: Array) -> Array:
         """Return the aligned positions of the file minus the reference positions (m).
 
-        The result contains north and east of the first position, then of the second, and so on.
-
-        ``fitted_parameters`` are trial values of the parameters in ``is_fitted``.
+        ``fitted_parameters`` are trial values of the parameters in ``is_fitted``; the other
+        parameters keep their initial values. The result contains north and east of the first
+        position, then of the second, and so on.
         """
         all_parameters = parameters.copy()
         all_parameters[is_fitted] = fitted_parameters

@@ -139,6 +139,7 @@ def compute_horizontal_range_m(track: SampledTrack) -> float:
 
 
 def _smooth_ekf2_track(state: pd.DataFrame) -> SampledTrack:
+    """Return EKF2's position at regular times, smoothed by a Gaussian filter."""
     finite_state = select_valid_rows(state, Columns.POSITION[:2])
     if len(finite_state) < MIN_MATCHED_SAMPLES:
         raise NoMatchError(

@@ -64,6 +64,7 @@ def connect_to_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
 
 
 def _check_versions(client: Client) -> None:
+    """Raise a SettingsError if a Dask worker and this computer have different px4fuse versions."""
     own_version = metadata.version("px4fuse")
     for name, version in client.run(metadata.version, "px4fuse", on_error="return").items():
         if version != own_version:

@@ -78,6 +78,7 @@ def make_failure_row(error: Px4FuseError, name: str = "") -> Row:
 
 
 def _compare_log(job: Job, path: Path, sha256: str) -> LogOutcome:
+    """Analyse one log in a worker process; return its table rows, JSON results and report."""
     # slow imports, which only the worker processes need
     from px4fuse.analysis import AidingSourceAnalysis  # noqa: PLC0415
     from px4fuse.diagnose import diagnose_or_check_aids, read_flight  # noqa: PLC0415

@@ -115,6 +115,7 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
 
 
 def _make_log_cells(log: LogSummary) -> tuple[Cell, ...]:
+    """Return the cells of a log in the table of the web page: diagnosis, σ ratios, properties."""
     finding_titles = [finding_title(finding) for finding in log["findings"]]
     severity, action = log["severity"], log.get("action", "")
     css_class = "command" if action.startswith(("px4fuse ", "param ")) else ""
@@ -141,6 +142,7 @@ def _make_log_cells(log: LogSummary) -> tuple[Cell, ...]:
 
 
 def _make_ratio_cell(ratio: float | None, column_name: str, verdict: str) -> Cell:
+    """Return the cell of a σ ratio; empty for None."""
     if ratio is None:
         return Cell()
     emphasis_css_class = " loud" if verdict in ("overconfident", "underconfident") else ""
@@ -155,6 +157,8 @@ def sort_logs(logs: Iterable[LogSummary]) -> list[LogSummary]:
     """Sort logs by severity, then |ln(σ ratio)|, then position RMSE, largest first."""
 
     def compute_sort_key(log: LogSummary) -> tuple[float, ...]:
+        """Return the key that sorts logs: first the most severe, then the least consistent."""
+        # σ ratios of this log; a missing ratio, or a ratio of 0 (without logarithm), is omitted
         ratios = [log[key] for name in SIGMA_RATIO_LABELS if log.get(key := f"{name}_ratio")]
         largest_log_ratio = max((abs(math.log(ratio)) for ratio in ratios), default=0.0)
         return (
@@ -167,6 +171,8 @@ def sort_logs(logs: Iterable[LogSummary]) -> list[LogSummary]:
 
 
 def _make_log_details(log: LogSummary) -> tuple[RowDetailsSection, ...]:
+    """Return the sections that open below a log in the table of the web page."""
+    # one row per quantity: its name, and its value for each axis. Rows without a value are omitted
     value_rows = [
         [name, *(_format_value(axis.get(name, "")) for axis in log["axes"])]
         for name in AXIS_COLUMNS
@@ -180,7 +186,9 @@ def _make_log_details(log: LogSummary) -> tuple[RowDetailsSection, ...]:
             is_warning=True,
         ),
         frame.make_list_section(
-            "Actions", list(dict.fromkeys(remedy for _, remedy in log["missing_results"] if remedy))
+            # each action once: several axes may need the same action
+            "Actions",
+            list(dict.fromkeys(remedy for _, remedy in log["missing_results"] if remedy)),
         ),
         frame.make_list_section(
             "Findings",
@@ -191,6 +199,7 @@ def _make_log_details(log: LogSummary) -> tuple[RowDetailsSection, ...]:
 
 
 def _make_file_and_flight_sections(log: LogSummary) -> tuple[RowDetailsSection, ...]:
+    """Return the links to report and results of a log, and the values that describe the flight."""
     return (
         frame.make_links_section(
             "Files", [(label, make_relative_url(log.get(name, ""))) for label, name in FILE_LINKS]

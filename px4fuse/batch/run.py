@@ -215,8 +215,8 @@ def _make_jobs(
     state: _BatchState, logs: Iterable[LogAddress], request: ComparisonRequest, reports: bool
 ) -> list[Job]:
     """Return a job for each log, and register in ``state`` the logs of an earlier run."""
-    # a worker process computes the SHA-256 of a log, and compares it only with finished logs of the
-    # same size: a set of all finished logs would be large
+    # Hashes of the finished logs by file size. A worker process gets only the hashes of logs that
+    # have the same size as its log, because the set of all hashes may be large
     hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
     for cached_rows in load_cached_rows(state, reports):
         state.cached_rows_by_hash[cached_rows.sha256] = cached_rows
@@ -262,12 +262,13 @@ def _cache_outcome(state: _BatchState, log: LogAddress, outcome: LogOutcome | Jo
         return
     if not outcome.rows:  # a log with results from an earlier run
         state.reused_hashes.add(outcome.sha256)
-    elif outcome.sha256 not in state.cached_rows_by_hash:  # otherwise two logs are identical
+    elif outcome.sha256 not in state.cached_rows_by_hash:  # otherwise already written
         state.cached_rows_by_hash[outcome.sha256] = _write_log(state, log, outcome)
     state.hash_by_log_address[log.address] = outcome.sha256
 
 
 def _write_log(state: _BatchState, log: LogAddress, outcome: LogOutcome) -> CachedRows:
+    """Write the results of one log to the output folder: JSON, PDF and its table rows."""
     path_stem = f"results/{make_file_stem(log.name, outcome.sha256)}"
     # a log that was not compared has no results, and without --reports there is no PDF
     json_path = f"{path_stem}.json" if outcome.results_json else ""

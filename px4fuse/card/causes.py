@@ -149,7 +149,7 @@ def _find_cause_rank(finding: Finding, reruns: Sequence[Rerun]) -> int:
 def find_reruns_of_finding(reruns: Iterable[Rerun], finding: Finding) -> tuple[Rerun, ...]:
     """Return the best re-run for each filter and each kind of change that tests a finding.
 
-    The best re-runs make the filter consistent, see
+    Re-runs that make the filter consistent are preferred, see
     :func:`~px4fuse.comparison.rerun_effects.compute_preference_key`.
     """
     tested_change_kinds = FINDING_CATALOGUE[finding.id].rerun_kinds
@@ -183,7 +183,7 @@ def make_cause(
     sigma_verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> DiagnosedCause:
-    """Describe a fault, with actions for position source, KF and EKF2."""
+    """Describe one cause of the diagnosis, with actions for position source, KF and EKF2."""
     finding, reruns = ranked_cause.finding, ranked_cause.reruns
     useful_reruns = [rerun for rerun in reruns if may_improve_filter(rerun)]
     alternative_action_groups, actions = _make_actions(
@@ -271,13 +271,14 @@ def _make_setting_actions(
         if rerun.kinds == ("delay",):  # _make_actions makes this action
             continue
         if rerun.filter == "ekf2":
-            # Keep only changes of EKF2 parameters. If the re-run also corrected the data, the
-            # action for the sender states this correction
+            # Omit corrections of the data, such as a time offset: they are not EKF2 parameters. The
+            # action for the sender contains them
             change = {name: value for name, value in change.items() if name in MODEL_PARAMETERS}
             if change:
                 yield make_parameter_action(analysis, change)
-        # A re-run of KF with default settings gives no command here: the last sentence of the cause
-        # states that KF is consistent with default settings
+        # Default settings of KF need no command, because the description of the cause already
+        # states that KF is consistent with them. Corrections of the data without an option have no
+        # command
         elif rerun.kinds != ("defaults",) and change.keys() <= COMPARISON_OPTIONS.keys():
             # --clock-offset replaces the offset from the alignment, so it must include that offset
             if TIME_OFFSET_KEY in change and (alignment := analysis.source.alignment):
@@ -316,12 +317,12 @@ def _make_sender_actions(
     - Other faults: the action of the finding, if it has one.
     """
     finding, source, model = ranked_cause.finding, analysis.source, analysis.ekf2_model
-    # If a re-run with shifted timestamps improves a filter, the sender must shift its timestamps. A
-    # GNSS receiver cannot do this, so the action of the finding is used for it
+    # The sender must shift its timestamps if a re-run with shifted timestamps improves a filter. A
+    # GNSS receiver cannot shift them, so the remedy of the finding is used for GNSS
     if offset_rerun and not (source.origin.is_gnss and finding.remedy):
         shift_s = offset_rerun.change[TIME_OFFSET_KEY]
-        # In a re-run of KF, the shift includes the clock offset that this analysis already applies
-        # (--clock-offset). The sender must add only the rest
+        # The shift of a KF re-run includes the offset --clock-offset, which this analysis already
+        # applies. Subtract this offset: only the remaining shift is an error of the sender
         if offset_rerun.filter == "kf":
             shift_s -= analysis.settings.clock_offset_s
         return [Action("sender", lowercase_first_letter(format_sender_action(source, shift_s)))]
@@ -344,6 +345,8 @@ def _make_sender_actions(
 def _explain_missing_action(
     finding: Finding, filter_name: FilterName, sigma_verdicts: Sequence[Verdict]
 ) -> str:
+    """Return the reason why the settings of a filter need no change, or "" without any verdict."""
+    # Verdict of the filter against "source" (innovations) and against "truth" (ground truth)
     verdict_by_reference = {
         verdict.against: verdict.word
         for verdict in sigma_verdicts
@@ -375,8 +378,8 @@ def _find_action_target(finding: Finding, source: PositionTrack | None = None) -
     """Return the device or filter to which the remedy of a finding applies."""
     group = FINDING_CATALOGUE[finding.id].group
     target = ACTION_TARGET_BY_FINDING_ID.get(finding.id) or ACTION_TARGET_BY_GROUP[group]
-    # The group of a finding on the source has the sender as its target. But if the remedy changes
-    # an EKF2 parameter, the action applies to EKF2
+    # The remedy of a finding about the position source is normally for the sender. If the remedy
+    # names an EKF2 parameter, it is for EKF2
     is_remedy_about_ekf2_parameter = finding.remedy.startswith(("Set EKF2_", "Check EKF2_"))
     # Errors above the reported σ are one finding for both filters. If its evidence contains no σ of
     # KF, only EKF2 is overconfident
@@ -392,6 +395,7 @@ def _find_action_target(finding: Finding, source: PositionTrack | None = None) -
 
 
 def make_parameter_action(analysis: Analysis, change: Mapping[str, float]) -> Action:
+    """Return an action with the MAVLink console commands that change EKF2 parameters."""
     model = analysis.ekf2_model
     logged_parameters = {} if isinstance(model, Unavailable) else model.inputs.settings
     change_texts, commands = [], []
@@ -431,6 +435,7 @@ def _pair_known(before: float | None, after: float | None) -> tuple[float, float
 
 
 def _format_rerun_label(rerun: Rerun) -> str:
+    """Return filter and change of a re-run, for example "EKF2 (replay), EKF2_EV_DELAY 100"."""
     (kind,) = rerun.kinds
     label = TARGET_BY_ADJUSTABLE_FILTER[rerun.filter] + " (replay)" * (rerun.filter == "ekf2")
     if OUTLIERS_KEY in rerun.change:
@@ -447,6 +452,7 @@ def _format_rerun_label(rerun: Rerun) -> str:
 
 
 def _format_closing_sentence(useful_reruns: Sequence[Rerun], *, has_alternatives: bool) -> str:
+    """Return the last sentence about a cause: a remark on its actions or re-runs, or ""."""
     if has_alternatives:
         return (
             "For the next flights, correct either the sender or the delay parameter, not both. "

@@ -31,6 +31,7 @@ def make_sigma_verdicts(result: AxisComparison) -> tuple[Verdict, ...]:
 
 
 def _assess_against_source(result: AxisComparison, filter_name: FilterName) -> Verdict:
+    """Return the verdict from innovations; "not evaluated" if they are not available."""
     summary = result.filters[filter_name]
     if not isinstance(summary, FilterSummary):
         return _make_unevaluated_verdict(filter_name, "source", summary)
@@ -45,6 +46,7 @@ def _assess_against_source(result: AxisComparison, filter_name: FilterName) -> V
 
 
 def _assess_against_truth(result: AxisComparison, filter_name: FilterName) -> Verdict:
+    """Return the verdict from errors against ground truth; "not evaluated" if none is available."""
     truth = result.filters[filter_name].truth
     errors = (
         truth if isinstance(truth, Unavailable) else compute_normalised_errors(result, filter_name)

@@ -19,9 +19,9 @@ def diff(a: Path, b: Path, json_path: Path | None) -> None:
     A and B are flight logs, reports (PDF) of px4fuse compare, or their results (JSON).
 
     Exit code 0: B is not worse; 1: B is worse; 2: invalid input. B is worse if it has a new finding
-    of severity error, or if KF or EKF2 is consistent along an axis in A but not in B. A consistent
-    filter has a mean NIS in the 95 % band, or √S is wrong by a factor below 1.25. In addition, the
-    position σ of a consistent filter is wrong by a factor of at most 2 (mean NEES).
+    of severity error, or if a mean NIS or mean NEES of KF or EKF2 is consistent in A but not in B.
+    A mean NIS is consistent if it is in its 95 % band, or if √S is wrong by a factor of at most
+    1.25. A mean NEES is consistent if the position σ is wrong by a factor of at most 2.
     """
     from px4fuse.batch.changes import diff as compare_inputs
     from px4fuse.batch.terminal import format_differences

@@ -74,6 +74,7 @@ def extract(
 
 
 def _require_same_flight(folder: Path, sha256: str) -> None:
+    """Raise ``OutputError`` if a folder already contains the tables of another log."""
     try:
         with protect_inputs(is_active=False):
             text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)

@@ -16,6 +16,7 @@ from .outputs import make_result_files, progress, write_and_print_results
 
 
 def _print_versions(context: click.Context, _: click.Parameter, is_requested: bool) -> None:
+    """Print the versions of px4fuse, Python and libraries, and end the command (``--versions``)."""
     if not is_requested:
         return
     import platform

@@ -19,7 +19,7 @@ def kalman() -> None:
 
 @lesson.command()
 def loop() -> None:
-    """Print Example 2 of the course: loop closure error, distributed by distance."""
+    """Print worked example 2: loop closure error, distributed by distance."""
     from px4fuse.lesson import format_loop_example_lines
 
     for line in format_loop_example_lines():

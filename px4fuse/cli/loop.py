@@ -26,6 +26,7 @@ POSE_GRAPH_ARGUMENT_NAMES = ("source", "json_path", "g2o_path", "robust")
 
 
 def _parse_numbers(text: str, syntax: str, max_absolute_value: float) -> list[float]:
+    """Parse two or three numbers with commas between them."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
@@ -223,6 +224,7 @@ def _format_output_files(
 def _solve_graph(
     source: Path, json_path: Path | None, g2o_path: Path | None, robust: bool | None
 ) -> None:
+    """Optimise a pose graph from a g2o file, and write the results."""
     from px4fuse.readers.g2o import format_g2o, read_g2o
     from px4fuse.report.loop import make_pose_graph_page
     from px4fuse.results.build import make_graph_results

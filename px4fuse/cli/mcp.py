@@ -124,8 +124,8 @@ def run_command(
     """
     readable_folders.set(folders)
     max_log_bytes.set(max_bytes)
-    # the command writes its report to reports/ in the current folder. Only a worker process, which
-    # has a sender, changes its current folder: the server process writes no reports
+    # The command writes its report to reports/ in the current folder. Only worker processes, which
+    # have a ``sender``, change their current folder: the server process writes no reports
     if report_folder and sender:
         os.chdir(report_folder)
     output, results_json_texts = io.StringIO(), list[str]()
@@ -150,9 +150,9 @@ def run_command(
 
 
 def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
-    """Return each tool of the server with the function that parses the arguments of the tool.
+    """Return each tool of the MCP server with the function that parses its arguments.
 
-    Input schema: from the options of the command. Output schema: from the type of the results.
+    The options of the px4fuse command give the input schema, its JSON results the output schema.
     """
     from mcp.types import Tool
 
@@ -210,6 +210,8 @@ def _list_parameters(command_name: str) -> dict[str, click.Parameter]:
 
 
 def _make_schema(parameter: click.Parameter) -> dict[str, Any]:
+    """Return the JSON Schema of the values that an option of a command accepts."""
+    # Without another type below, the value is a text without null characters
     value_type, schema = parameter.type, dict[str, Any](type="string", pattern=r"^[^\x00]+$")
     if isinstance(value_type, click.Choice):
         schema = {"enum": [*value_type.choices]}

@@ -160,6 +160,7 @@ def check_default_page(path: Path, page: str) -> None:
 
 
 def _require_replaceable_file(path: Path, kind: str, can_replace: Callable[[bytes], bool]) -> None:
+    """Raise ``OutputError`` if a file exists that must not be replaced."""
     try:
         may_replace = not path.exists() or can_replace(path.read_bytes())
     except (OSError, UnicodeDecodeError, ResultsError):
@@ -245,8 +246,8 @@ def make_result_files(
     """
     from px4fuse.results.contract import to_json
 
-    # px4fuse mcp gives --json - if it must not write a report. Choose the report path before
-    # json_path "-" is replaced by None below
+    # If px4fuse mcp wants no report, json_path is "-" (standard output). The default report path
+    # must be chosen before "-" is replaced by None below
     if default_stem and output is None and json_path is None:
         output = choose_default_report_path(default_stem, results)
     json_text, contents = to_json(results), dict[Path, bytes]()

@@ -16,7 +16,7 @@ from .outputs import make_result_files, progress, write_and_print_results
 @analysis_options
 @json_option
 def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
-    """Estimate SIGMA_A and SIGMA_Z by maximum likelihood.
+    """Estimate the process noise SIGMA_A and the measurement noise SIGMA_Z of KF.
 
     Prints the estimates for each axis with 95 % intervals, and compares them with --sigma-a and
     --sigma-z. LOG is a PX4 ULog or a MAVLink recording.

@@ -15,6 +15,7 @@ _SWEEP_PATTERN = re.compile("([^=]*)=([^:]*):([^:]*)(?::([0-9]+))?")
 
 
 def _parse_number(parameter_name: str, text: str) -> Any:
+    """Parse the value of an EKF2 parameter in the unit that PX4 uses for this parameter."""
     from px4fuse.flight.ekf2_parameters import MODEL_PARAMETERS
 
     unit = (

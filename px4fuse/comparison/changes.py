@@ -221,6 +221,7 @@ def _find_kf_noise_changes(
 
 
 def _find_bias_changes(estimates: Estimates) -> list[ChangedValues]:
+    """Return the change that removes a significant accelerometer bias, if any."""
     systematic_errors = estimates.systematic_errors
     if isinstance(systematic_errors, Unavailable) or not systematic_errors.has_significant_bias():
         return []

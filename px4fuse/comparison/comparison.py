@@ -73,6 +73,7 @@ def compare(prepared_comparison: PreparedComparison) -> Comparison:
 def _compare_axis(
     prepared_comparison: PreparedComparison, ekf2: Ekf2 | Unavailable, axis: Axis, *, is_main: bool
 ) -> AxisComparison:
+    """Run KF along one axis, and compare KF and EKF2 with each other and with ground truth."""
     segment = prepared_comparison.segment
     # Only the axis of largest motion, which the report shows step by step, needs filterpy
     kf_run = run_kf(axis, prepared_comparison.settings, fast=not is_main)
@@ -151,6 +152,7 @@ def project_tracks(
 def _summarise_filter(
     tracks: FilterTracks, truth: ErrorsAgainstTruth | Unavailable
 ) -> FilterSummary | UntestedFilter:
+    """Return the consistency of a filter, its reported σ, and its errors against ground truth."""
     innovations, variance = tracks.innovations, tracks.variance
     # Fields that FilterSummary and UntestedFilter have in common
     common_fields: dict[str, Any] = {"truth": truth}
@@ -216,7 +218,8 @@ def find_compared_track(
     """Return the state and variance of a filter that are compared with ground truth.
 
     EKF2: logged values. KF: values predicted to EKF2's sample times. If EKF2 is not logged, KF's
-    values at the ends of KF's prediction steps.
+    values at the ends of KF's prediction steps. A table of KF contains both state and variance, so
+    it is returned twice.
     """
     if tracks.run is None:
         return tracks.state, tracks.variance
@@ -334,6 +337,7 @@ def compute_normalised_errors(
 def _assess_horizontal_innovations(
     north_and_east: Iterable[FilterTracks],
 ) -> HorizontalNis | None:
+    """Test the NIS of north and east together; None if an axis has no innovations."""
     tables = [
         tracks.innovations[INNOVATION_COLUMNS]
         for tracks in north_and_east

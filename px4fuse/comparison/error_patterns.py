@@ -95,8 +95,8 @@ MAX_ATTITUDE_DELAY_S = 0.5
 # Minimum reported delay (s) of the logged attitude
 MIN_ATTITUDE_DELAY_S = 0.04
 MAX_ROTATION_COUNT = 20_000
-# Delay of the logged attitude: duration (s) of the rotations from attitude and gyroscopes that are
-# compared
+# Duration (s) of each rotation that is computed from the attitude, and compared with that from the
+# gyroscopes, to find the delay of the logged attitude
 ROTATION_COMPARISON_TIME_S = 0.1
 # Differences (rad) between attitude and gyroscope rotations are limited to this value, because
 # attitude resets cause larger ones
@@ -172,8 +172,8 @@ class ErrorFit(NamedTuple):
     def compute_slow_error_mean_square_m2(self) -> float:
         """Return the mean square (m²) of the time-correlated position errors.
 
-        It is the mean square of the errors that remain after this fit, minus the variance of the
-        white noise.
+        It is the mean square of the residuals of the fit, minus the variance of the white noise.
+        Both are sums over the two horizontal axes.
         """
         return float(np.mean(self.residual_m**2, axis=0).sum()) - 2.0 * self.white_noise_sigma_m**2
 
@@ -224,13 +224,14 @@ def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
         return None
     interval_s = compute_median_interval_s(time_s)
     rows, weights = _compute_interpolation_weights(time_s, interval_s)
-    # If all values have the same σ, the residual (value - Σ weight · neighbour) has this multiple
-    # of σ. Positions with a large multiple are omitted, because their interpolation amplifies noise
+    # σ of the residual (value - Σ weight · neighbour) ÷ σ of the values. A large ratio means that
+    # the interpolation amplifies noise: such positions are omitted
     sigma_ratio = np.sqrt(1.0 + np.sum(weights**2, axis=1))
     is_accurate = sigma_ratio < MAX_RESIDUAL_TO_POSITION_SIGMA_RATIO
     rows, weights, sigma_ratio = rows[is_accurate], weights[is_accurate], sigma_ratio[is_accurate]
 
     def compute_residual(values: Array) -> Array:
+        """Return value minus interpolation at ``rows``, scaled to the σ of the values."""
         neighbours = values[rows[:, None] + NEIGHBOUR_ROW_OFFSETS]
         residuals = values[rows] - np.einsum("nk,nk...->n...", weights, neighbours)
         return np.asarray((residuals.T / sigma_ratio).T)
@@ -264,10 +265,11 @@ def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
 
 
 def _compute_interpolation_weights(time_s: Array, interval_s: float) -> tuple[Array, Array]:
-    """Return rows, and for each row the weights of its four neighbours in a cubic interpolation.
+    """Return the rows to interpolate, and the weights of their neighbours: shapes (m,) and (m, 4).
 
-    Rows near gaps are omitted. The weights w of neighbours at elapsed times t interpolate cubic
-    polynomials exactly: Σ w = 1, and Σ w tᵏ = 0 for k = 1, 2, 3.
+    Row i is interpolated from the rows i - 2, i - 1, i + 1 and i + 2. Rows near gaps are omitted.
+    Neighbours have the time differences t to row i. Their weights w interpolate cubic polynomials
+    exactly: Σ w = 1, and Σ w tᵏ = 0 for k = 1, 2, 3.
     """
     rows = np.arange(2, len(time_s) - 2)
     neighbour_rows = rows[:, None] + NEIGHBOUR_ROW_OFFSETS
@@ -280,7 +282,11 @@ def _compute_interpolation_weights(time_s: Array, interval_s: float) -> tuple[Ar
 
 
 def find_timestamp_jitter(errors: LocalResiduals) -> float | None:
-    """Return the timestamp jitter (s, 1 σ), if position errors confirm it."""
+    """Return the timestamp jitter (s, 1 σ), if position errors confirm it, else None.
+
+    A timestamp that is late by Δt causes the position residual -velocity · Δt. This expected
+    residual must agree with the measured residual.
+    """
     expected_residual_m = -errors.velocity_m_s * errors.timestamp_jitter_s[:, None]
     expected_square_sum_m2 = float(np.sum(expected_residual_m**2))
     jitter_s = float(np.std(errors.timestamp_jitter_s))
@@ -293,8 +299,7 @@ def find_timestamp_jitter(errors: LocalResiduals) -> float | None:
     residual_ratio_sigma = np.sqrt(
         RESIDUAL_CORRELATION_LENGTH * np.mean(unexplained_residual_m**2) / expected_square_sum_m2
     )
-    # Measured and expected residuals agree if their ratio is near 1 and significantly above 0. The
-    # jitter must also cause much of the position noise
+    # RMS of the expected residuals ÷ RMS of the measured residuals
     jitter_fraction = np.sqrt(expected_square_sum_m2 / np.sum(errors.residual_m**2))
     is_jitter = (
         RESIDUAL_TO_JITTER_ERROR_RATIO_LIMITS[0]
@@ -319,7 +324,8 @@ def find_speed_dependent_noise(errors: LocalResiduals) -> SpeedDependentNoise | 
     # Constant values have no rank correlation
     if not np.all([np.ptp(part, axis=0) for part in flight_parts]):
         return None
-    # Correlations ÷ σ, which is 1 / √n for n independent values without relation
+    # Correlations as z-scores: divided by their σ, which is 1 / √n for n independent samples
+    # without correlation
     flight_z_score, *part_z_scores = (
         rank_correlation(*part.T) * np.sqrt(len(part) / RESIDUAL_CORRELATION_LENGTH)
         for part in (norms_and_speeds, *flight_parts)
@@ -398,9 +404,9 @@ def fit_errors_against_truth(
     scale_error_sigma = np.sqrt(
         np.mean(residual_m**2) / (path_mean_square_m2 * independent_error_count)
     )
-    # The drift of odometry is no fault. Subtract running means from the errors and from the
-    # columns, so that drift hardly affects the residuals. This makes the columns of the constant
-    # offsets zero, so omit them
+    # The drift of odometry is no fault. Subtract running means from errors and derivatives, so that
+    # drift hardly affects the residuals. The derivatives for constant offsets become zero and are
+    # omitted
     if comparison.source.origin.may_drift:
         from scipy.ndimage import uniform_filter1d  # noqa: PLC0415 - slow import
 
@@ -459,6 +465,7 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
     frequency_hz = float(frequency_step_hz * (first_k + np.argmax(powers)))
 
     def compute_mean_square_m2(values: Array) -> float:
+        """Return the mean square (m²) of the sinusoid at ``frequency_hz`` in ``values`` (n, 2)."""
         # Mean square of a sinusoid ½ a², with amplitude a = 2 |mean of the values · exp(-iωt)|
         complex_sinusoid = np.exp(-2j * np.pi * frequency_hz * fit.time_s)
         return 2.0 * float(np.sum(np.abs(complex_sinusoid @ values / len(values)) ** 2))
@@ -572,6 +579,8 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
     gyro_rotation_rad = angle_rad[samples_per_rotation:] - angle_rad[:-samples_per_rotation]
 
     def compute_mean_square_rad2(delay_in_rows: int) -> float:
+        """Return the mean square rotation difference for an attitude that is late by this delay."""
+        # The attitude in row i shows the rotation of the gyroscopes delay_in_rows earlier
         first_row = max_delay_in_rows - delay_in_rows
         rotation_differences_rad = (
             rotation_rad - gyro_rotation_rad[first_row : first_row + len(rotation_rad)]

@@ -368,15 +368,15 @@ def widen_for_scatter(time_offset: SourceTimeOffset, cause: str) -> SourceTimeOf
     """
     offsets_s = np.array([part.offset_s for part in time_offset.parts])
     weights = np.array([part.sigma_s**-2.0 for part in time_offset.parts])
-    # The clock drift cannot be distinguished from scatter: withdraw it. Test a change against the
-    # scatter instead of σ
+    # Scatter of the time offsets looks like clock drift: withdraw the drift. Test for a change of
+    # the time offset with the scatter as σ
     time_offset = structs.replace(
         time_offset,
         drift_ppm=None,
         drift_sigma_ppm=None,
         change_p_value=_compute_change_p_value(offsets_s, weights),
     )
-    # Too few parts to estimate the scatter
+    # Too few time offsets to estimate their scatter
     if len(offsets_s) <= MIN_OFFSETS_BEFORE_AND_AFTER_CHANGE:
         return time_offset
     # Mean square of the deviations from the weighted mean ÷ σ² (chi-square ÷ degrees of freedom)
@@ -408,8 +408,9 @@ def _compute_weighted_square_sum(offsets_s: Array, weights: Array) -> float:
 def _compute_change_p_value(offsets_s: Array, weights: Array) -> float | None:
     """Return the p-value of the largest change of the time offset; None for a short flight.
 
-    Method: Student's t-test with Bonferroni correction. ``weights`` are 1/σ² of the offsets; a
-    scatter above σ enlarges the tested σ, a smaller scatter does not reduce it.
+    ``offsets_s`` are the time offsets of consecutive flight parts, ``weights`` their 1/σ². Each row
+    is tested as the first row after a change (Student's t-test with Bonferroni correction). If the
+    offsets scatter by more than their σ, the test uses the scatter instead of σ.
     """
     degrees_of_freedom = len(offsets_s) - 2
     split_rows = range(

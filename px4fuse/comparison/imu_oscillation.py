@@ -44,7 +44,9 @@ def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | Non
     """Find an oscillation of the horizontal acceleration that the positions do not show.
 
     Second differences of the positions are compared with those of the doubly integrated
-    acceleration, in axes that turn with the heading. Complex numbers are north + i east.
+    acceleration. Complex numbers are forward + i · right, in axes that turn with the heading.
+    Return None if no frequency shows a large oscillation of the IMU that is missing in the
+    positions.
     """
     signals = _compute_second_differences(comparison)
     if signals is None:
@@ -98,9 +100,10 @@ def find_imu_oscillation(comparison: PreparedComparison) -> ImuOscillation | Non
 
 
 def _compute_second_differences(comparison: PreparedComparison) -> tuple[Array, float] | None:
-    """Return second differences (m) of source and IMU positions in two rows, and interval (s).
+    """Return the second differences (m) of source and IMU positions, and their interval (s).
 
-    The axes turn with the heading: real part forward, imaginary part right.
+    Row 0: source, row 1: IMU. The numbers are complex: forward + i · right, in axes that turn with
+    the heading. Return None without acceleration or attitude, or with too few positions.
     """
     acceleration, attitude = comparison.input_axes[0].acceleration, comparison.flight.attitude
     samples = comparison.source_samples[Columns.POSITION[:2]].dropna()

@@ -46,7 +46,7 @@ class FilterTracks:
     Attributes
     ----------
     state : DataFrame or Unavailable
-        Position and velocity; for EKF2 without resets of the frame's origin.
+        Position and velocity. Jumps of EKF2's track by resets of its origin are removed.
     innovations : DataFrame or Unavailable
         Innovations, and position variance before and after each update.
     run : KfRun or None
@@ -160,7 +160,7 @@ class AxisComparison(Record, kw_only=True):
     rejected_fraction : float or None
         Fraction of the positions that EKF2 rejected; None if not logged.
     whole_flight_tracks : (FilterTracks, DataFrame or Unavailable)
-        EKF2 and ground truth over the whole flight, innovations only in the segment.
+        EKF2 and ground truth over the whole flight, but innovations in the analysed segment.
     """
 
     heading_deg: float | None = None

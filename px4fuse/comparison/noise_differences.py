@@ -40,7 +40,9 @@ class NoisyFlightPart(NamedTuple):
 def tune_perpendicular_axes(comparison: Comparison) -> tuple[AxisTuning, ...]:
     """Estimate separate noises along two perpendicular axes, if the noises seem to differ.
 
-    The axes are north and east, or the directions of the largest and the smallest noise.
+    The axes are the directions of the largest and the smallest noise if north and east are
+    correlated, else north and east. Return () if north or east is missing, or if they are not
+    correlated and their mean NIS are similar.
     """
     compared_axes = select_north_and_east(comparison)
     summaries = [axis.filters["kf"] for axis in compared_axes]
@@ -110,7 +112,7 @@ def find_noisy_flight_part(
     part_edges = np.linspace(0, len(time_s), part_count + 1).astype(int)
 
     def compute_scaled_innovations(is_excluded: BoolArray | None) -> Array:
-        # |innovation| / √S of each axis ÷ its median: without the effect of a wrong noise setting
+        """Return |innovation| / √S divided by its median, shape (axes, n)."""
         axis_innovations = [
             innovations(axis_motion, sigma_a, sigma_z, is_excluded) for axis_motion in axis_motions
         ]

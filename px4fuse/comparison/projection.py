@@ -74,8 +74,8 @@ def remove_origin_resets(
             continue
         has_only_moved_origin = False
         if quantity == "position":  # a velocity does not depend on the origin
-            # If the resets only moved the origin of EKF2's frame, EKF2's track is nearer to the
-            # measured positions after their removal
+            # Resets that only move the origin are recognised by the distance to the measured
+            # positions: without the resets, EKF2's track is closer to them
             samples = cut_to_segment(track.samples, segment)[columns].dropna()
             compute_squared_distance_m2 = partial(_compute_squared_distance_m2, samples)
             candidates = _make_states_without_resets(ekf2.state[columns], resets, axes)
@@ -129,7 +129,11 @@ def _compute_squared_distance_m2(samples: pd.DataFrame, state: pd.DataFrame) -> 
 
 
 def project(table: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
-    """Project positions, velocities and variances onto an axis."""
+    """Cut a table to a time segment, and project positions, velocities and variances onto an axis.
+
+    Quantities without columns in ``table`` are omitted. Variances are projected with squared
+    direction cosines, without covariances.
+    """
     rows = cut_to_segment(table, segment)
     projected_columns = {
         name: weighted_sum(rows, columns, axis.direction**exponent)
@@ -242,6 +246,7 @@ def project_innovations(
 def _combine_north_and_east(
     north_innovations: pd.DataFrame, east_innovations: pd.DataFrame, direction: Array
 ) -> pd.DataFrame:
+    """Project the innovations of north and east onto a horizontal axis, at their common times."""
     common_times = north_innovations.index.intersection(east_innovations.index)
     north, east = north_innovations.loc[common_times], east_innovations.loc[common_times]
     cosine, sine = float(direction[0]), float(direction[1])
@@ -292,6 +297,7 @@ def find_observation_variance(
 def project_truth(
     truth: Truth | Unavailable, axis: Axis, segment: Segment
 ) -> pd.DataFrame | Unavailable:
+    """Project ground truth onto an axis; Unavailable if the segment has hardly any of it."""
     if isinstance(truth, Unavailable):
         return truth
     projected_truth = project(truth.samples, axis, segment)

@@ -78,7 +78,8 @@ def estimate_gnss_delay_ms(
             for updates in update_tables
         ]
         # The number of updates depends on the delay. To compare the replays, scale the mean NIS to
-        # the number of received positions (each with the NIS of 2 axes · position and velocity)
+        # the number of received positions. Each position has 4 NIS: position and velocity along 2
+        # axes
         nis_sums.append(float(np.mean(nis)) * len(nis) * len(received_positions.timestamp_s))
     # Normal distribution: NIS sum = -2 ln p = (delay - estimate)² / σ² + constant. Fit this
     # parabola
@@ -170,7 +171,10 @@ def estimate_delay_if_not_as_logged_ms(
 def describe_delay_limit(
     parameter_name: str, estimated_delay_ms: float, logged_delay_ms: float
 ) -> str:
-    """Return the reason why PX4 does not permit a delay: "exceed 300 ms", "be negative" or ""."""
+    """Return why PX4 does not permit a delay, as the end of a sentence "EKF2_EV_DELAY cannot ...".
+
+    The result is "exceed 300 ms" or "be negative"; it is "" if PX4 permits the delay.
+    """
     if estimated_delay_ms > (maximum_ms := MODEL_PARAMETERS[parameter_name].maximum):
         return f"exceed {maximum_ms:g} ms"
     return "be negative" if round(estimated_delay_ms) <= 0.0 == logged_delay_ms else ""
@@ -238,7 +242,11 @@ def make_noise_change(
 
 
 def make_delay_change(ekf2_inputs: ReplayInputs, delay_ms: float) -> dict[str, float]:
-    """Return the EKF2 parameters for a delay of the positions, if PX4 permits the delay."""
+    """Return the EKF2 parameters that set the delay of the positions.
+
+    The parameters are the delay and, if necessary, EKF2_DELAY_MAX. Unchanged parameters are
+    omitted. Return {} if the delay exceeds PX4's maximum, or if PX4 ignores the delay parameter.
+    """
     delay_name = ekf2_inputs.aid.delay
     parameter = MODEL_PARAMETERS[delay_name]
     if delay_ms > parameter.maximum or ekf2_inputs.received_positions.uses_sender_timestamps:

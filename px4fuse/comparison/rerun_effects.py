@@ -34,8 +34,8 @@ POSSIBLE_CAUSE_EXPLAINED_FRACTION_TOLERANCE = 0.5
 # A sensor fault is sufficient as the only cause of a wrong σ if its correction reduces |ln(mean
 # NIS)| or |ln(mean NEES)| to at most this fraction of its value before
 ONLY_CAUSE_EXPLAINED_FRACTION_TOLERANCE = 0.25
-# A change is tested together with another change if it reduces |ln(mean NIS)| or |ln(mean NEES)| to
-# less than this fraction of its value before
+# ln(mean NIS) and ln(mean NEES) are 0 for a consistent filter. A change is combined with another
+# change if it alone reduces |ln(mean)| to less than this fraction of the value without it
 COMBINED_CHANGE_EXPLAINED_FRACTION_TOLERANCE = 0.9
 SENSOR_CORRECTION_KEYS = frozenset((OUTLIERS_KEY, TIME_OFFSET_KEY, ROTATION_KEY, FORWARD_BIAS_KEY))
 # Settings and data corrections that have an effect only together with another change
@@ -122,13 +122,15 @@ def compute_explained_fraction(rerun: Rerun, statistic: Statistic) -> float:
 
 
 def _compute_explained_fraction_error(rerun: Rerun, statistic: Statistic) -> float:
+    """Return |explained fraction - 1|: 0 if the change makes the mean NIS or mean NEES 1."""
     return abs(compute_explained_fraction(rerun, statistic) - 1.0)
 
 
 def brings_inside_limits(rerun: Rerun, statistic: Statistic) -> bool:
     """Return True if the mean NIS or mean NEES is inside its limits after the change.
 
-    The limits are the 95 % band of the mean NIS, and 0 to MIN_REPORTED_NEES for the mean NEES.
+    The mean NIS must be inside its 95 % band. The mean NEES must not be large enough to be
+    reported, so MIN_REPORTED_NEES is its upper limit.
     """
     low, high = 0.0, MIN_REPORTED_NEES
     if statistic == "nis":
@@ -166,6 +168,7 @@ def find_cause_rerun(
     """
 
     def rank(rerun: Rerun) -> tuple[bool, int, bool, float]:
+        """Return the sort key of a re-run; the smallest key is the most likely cause."""
         explained_fraction_error = _compute_explained_fraction_error(rerun, statistic)
         is_sufficient = brings_inside_limits(rerun, statistic) or (
             rerun.corrects_sensor
@@ -173,8 +176,9 @@ def find_cause_rerun(
         )
         # A parameter without effect alone, for example EKF2_DELAY_MAX, does not count as a change
         change_count = len(rerun.change.keys() - CHANGE_KEYS_WITHOUT_EFFECT_ALONE)
-        # min() prefers False to True: first sufficient re-runs, then few changes, then corrected
-        # sensor faults, then the smallest remaining inconsistency
+        # False is sorted before True: prefer changes that explain the inconsistency alone, then few
+        # changed values, then corrections of the sensor data, then the smallest remaining
+        # inconsistency
         return (
             not is_sufficient,
             change_count,
@@ -209,9 +213,10 @@ def find_partial_corrections(reruns: Iterable[Rerun], statistic: Statistic) -> l
 
 
 def compute_sigma_ratio_deviation(statistics: RunStatistics) -> float:
-    """Return the sum of |ln(actual σ ÷ reported σ)| over source and ground truth.
+    """Return the sum of |ln(actual σ ÷ reported σ)| over the available ratios; 0 if consistent.
 
-    The ratios are those of :func:`compute_sigma_ratios`. The sum is 0 for a consistent filter.
+    The ratios are those of :func:`compute_sigma_ratios`: from innovations, and from errors against
+    ground truth.
     """
     return sum(abs(math.log(ratio)) for ratio in compute_sigma_ratios(statistics).values())
 
@@ -269,8 +274,8 @@ def becomes_consistent(rerun: Rerun, tested_reference: Reference | None = None) 
 def halves_discrepancy(rerun: Rerun) -> bool:
     """Return True if a re-run at least halves |ln(actual σ ÷ reported σ)|.
 
-    Only ratios outside the limits of a consistent filter are tested, against position source and
-    ground truth.
+    The ratios are from innovations, and from errors against ground truth. Only ratios that are not
+    consistent before the change count; one halved ratio is sufficient.
     """
     return any(
         classify_sigma_ratio(ratio_before, reference) != "consistent"
@@ -346,8 +351,9 @@ def can_show_improvement(rerun: Rerun) -> bool:
 def classify_improvement(rerun: Rerun) -> Improvement:
     """Return the quantities that a re-run improves: position, σ, both or nothing.
 
-    The position improves if its RMSE decreases by at least 20 %. σ improves if its ratio (actual ÷
-    reported σ) against source or truth becomes consistent or half as wrong, and no ratio worsens.
+    The position improves if its RMSE decreases by at least 20 %. σ improves if a ratio (actual ÷
+    reported σ) becomes consistent, or |ln(ratio)| is halved, and no other ratio worsens. The ratios
+    are from innovations, and from errors against ground truth.
     """
     rmse_before_m, rmse_after_m = rerun.before.position_rmse_m, rerun.after.position_rmse_m
     is_position_better = bool(

@@ -103,7 +103,7 @@ def find_error_above_sigma(summary: FilterSummary | UntestedFilter) -> ErrorAbov
     fusion_horizon_nees = truth.nees_position_horizon_mean or nees
     if min(nees, fusion_horizon_nees) < MIN_REPORTED_NEES:
         return None
-    # Without a median of the reported σ: NEES = (error / σ)²
+    # If the median reported σ is missing, compute σ from NEES = (error / σ)²
     reported_sigma_m = summary.sigma_p_median_m or rmse_m / nees**0.5
     return ErrorAboveSigma(nees, rmse_m, reported_sigma_m, nis_mean)
 
@@ -146,8 +146,9 @@ def rerun_filters(
         and model.agreement.good
         and is_source_fused(comparison, model.inputs)
     ):
-
-        @cache  # one replay of each change for all axes; only hashable arguments can be cached
+        # One replay of each change for all axes. The argument is a frozenset, because a mapping
+        # cannot be the key of a cache
+        @cache
         def replay_ekf2(change_items: frozenset[tuple[str, float]]) -> Ekf2Replay:
             return _replay_ekf2(comparison, estimates.tuning, model, dict(change_items))
 
@@ -202,7 +203,8 @@ def _find_changes_to_test(
 ) -> list[tuple[ChangedValues, tuple[Statistic, ...]]]:
     """Return the changes to test along an axis, and the statistics that each change may correct.
 
-    ``ekf2_inputs`` is None for KF.
+    ``ekf2_inputs`` is None for KF. Along the main axis, all candidate changes are tested. Along
+    other axes, changes are tested only if the filter is inconsistent.
     """
     axis = axis_result.axis.name
     summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
@@ -254,6 +256,7 @@ def _rerun_with_changes(
         original_statistics = logged_statistics or original_statistics
 
     def make_rerun(change: ChangedValues, discrepancies: Iterable[Statistic]) -> Rerun:
+        """Re-run the filter with one change, and compare it with the run without change."""
         rerun_statistics = rerun_filter(axis_result, change)
         return Rerun(
             filter="kf" if model is None else "ekf2",
@@ -286,7 +289,11 @@ def _rerun_with_changes(
 def _find_logged_statistics(
     replayed: RunStatistics, axis_result: AxisComparison, evaluated_spans_s: Spans
 ) -> RunStatistics | None:
-    """Return the logged statistics of EKF2; None if those of the unchanged replay differ."""
+    """Return the logged statistics of EKF2; None if those of the unchanged replay differ.
+
+    ``replayed`` are the statistics of the replay without changes. They must agree with the logged
+    ones within a factor. Return None also if state or innovations are not logged.
+    """
     ekf2, innovations = axis_result.ekf2_tracks, axis_result.ekf2_tracks.innovations
     if isinstance(ekf2.state, Unavailable) or isinstance(innovations, Unavailable):
         return None
@@ -320,6 +327,7 @@ def _summarise_run(
     kf_minus_ekf2: FilterDifference | Unavailable | None,
     rejected_fraction: float | None = None,
 ) -> RunStatistics:
+    """Compute the statistics of one run of a filter along one axis."""
     nis = innovation_m**2 / innovation_variance_m2
     return RunStatistics(
         innovations=len(nis),
@@ -332,6 +340,7 @@ def _summarise_run(
 
 
 def _rotate_direction(direction: Array, rotation_deg: float) -> Array:
+    """Rotate a direction (NED) counterclockwise, seen from above, by an angle (°)."""
     return Rotation.from_euler("z", -rotation_deg, degrees=True).apply(direction)
 
 
@@ -385,6 +394,7 @@ def _rerun_kf(
 def _remove_accelerometer_bias(
     comparison: Comparison, change: ChangedValues
 ) -> Acceleration | Unavailable:
+    """Subtract the accelerometer bias in ``change`` from the IMU data, and integrate them again."""
     flight, imu = comparison.flight, comparison.flight.imu
     if isinstance(imu, Unavailable):
         return imu
@@ -398,6 +408,7 @@ def _remove_accelerometer_bias(
 def _replay_ekf2(
     comparison: Comparison, tuning: TuningByAxis, model: Ekf2Model, change: ChangedValues
 ) -> Ekf2Replay:
+    """Replay EKF2 with changed parameters, or with corrected positions."""
     if not change:
         return model.baseline_replay
     # A change contains parameters of EKF2, and corrections of the positions under other names
@@ -444,7 +455,7 @@ def _summarise_replay(
         )
         for name in ("innovation_variance", "observation_variance", "position_variance")
     )
-    # 2. Reported position variance, between P⁻ = S - R and P⁺
+    # 2. Reported position variance at each update: mean of P⁻ = S - R (before) and P⁺ (after)
     prior_variance_m2 = innovation_variance_m2 - observation_variance_m2
     variance_by_time = pd.DataFrame(
         {
@@ -457,7 +468,7 @@ def _summarise_replay(
     published_track = project(ekf2_replay.published_state, axis, comparison.segment)
     published_track = rows_inside(published_track, evaluated_spans_s)
     logged_state, track_compared_with_kf = axis_result.ekf2_tracks.state, published_track
-    # Without a change, compare KF with the logged EKF2, as in the report
+    # Without changed parameters or data, compare KF with the logged EKF2, as in the report
     if not change and not isinstance(logged_state, Unavailable):
         track_compared_with_kf = rows_inside(logged_state, evaluated_spans_s)
     return _summarise_run(

@@ -112,6 +112,7 @@ class SignedAxisPermutation(NamedTuple):
 
     @property
     def is_mirrored(self) -> bool:
+        """True if x, y, z are a left-handed frame."""
         return (self.vertical_sign * self.handedness < 0) != (self.vertical_axis == 1)
 
     def combine_horizontal_axes(self, positions: Array) -> ComplexArray:
@@ -137,6 +138,7 @@ class SignedAxisPermutation(NamedTuple):
         return directions[0], directions[1], directions[2]
 
     def compute_log_prior_odds(self, quarter_turns: int) -> float:
+        """Return the log prior odds (nats) of the axis directions after ``quarter_turns`` · 90°."""
         axes = self.compute_axis_directions(quarter_turns)
         if axes in LOG_PRIOR_ODDS_BY_AXES:
             return LOG_PRIOR_ODDS_BY_AXES[axes]
@@ -230,6 +232,7 @@ class Hypothesis:
         return float(self.parameters[HEADING] - self.quarter_turns * np.pi / 2.0)
 
     def is_similar_to(self, other: "Hypothesis", max_difference_rad: float = np.pi / 4.0) -> bool:
+        """Return True if axes and unit are equal, and delay and heading differ little."""
         heading_difference_rad = self.parameters[HEADING] - other.parameters[HEADING]
         return bool(
             abs(self.delay_s - other.delay_s) < 0.5
@@ -322,8 +325,8 @@ def find_convention_candidates(
     for quarter_turns, (column, permutation), (unit_index, unit) in product(
         range(4), enumerate(permutations), enumerate(METRES_PER_UNIT)
     ):
-        # Keep the best time offset of each combination of axes (permutation and quarter turns) and
-        # unit. At each time offset, the best rotation determines the quarter turns
+        # Keep the best time offset of each axis permutation, quarter turns and unit. Only time
+        # offsets count whose best rotation, rounded to 90°, gives these quarter turns
         scores_at_quarter_turns = np.where(
             nearest_quarter_turns[:, column] == quarter_turns, score[:, column, unit_index], -np.inf
         )
@@ -385,8 +388,8 @@ def _compute_log_likelihoods(
     )
     source_mean_squares = np.maximum(source_mean_squares, 1e-12)
 
-    # With u metres per unit, the mean square residual after the best rotation is
-    # u² · source² + IMU² - 2 · u · |correlation|. Division by 2 gives the mean of both axes
+    # Mean square (MS) residual after the best rotation, with u metres per unit:
+    # u² · MS(source) + MS(IMU) - 2 · u · |correlation|. Division by 2 gives the mean of both axes
     horizontal_mean_square_residual_m2 = (
         metres_per_unit**2
         * (
@@ -520,9 +523,9 @@ def _evaluate_hypothesis(
         np.array([MIN_HORIZONTAL_RESIDUAL_SIGMA_M, MIN_VERTICAL_RESIDUAL_SIGMA_M, 1e-6, 1e-6, 1e-6])
         ** 2,
     )
-    # Compute the log likelihood ratio of the two models. The first density is per metre and the
-    # second per unit of the source: ln(metres per unit) for each axis converts the first. Constant
-    # axes, such as missing heights, are omitted
+    # Log likelihood ratio of first model and null model. The density of the first model is per
+    # metre: ln(metres per unit) per axis converts it to the unit of the source. Constant axes, such
+    # as missing heights, are omitted
     is_axis_known = unconverted_second_differences.any(axis=0)
     log_likelihood_gain = (
         log_likelihoods[0]
@@ -530,8 +533,8 @@ def _evaluate_hypothesis(
         + np.log(metres_per_unit) * np.count_nonzero(is_axis_known)
         - np.sum(log_likelihoods[2:], where=is_axis_known)
     )
-    # 4. Scale of the positions from the weighted squares and products of source and IMU. Weights of
-    # a Student distribution, reduced because successive rows are correlated
+    # 4. Weights of the residuals by their Student distribution, reduced because successive rows are
+    # correlated
     weight = 1.0 / (variances[:2, None] + residual_squares / STUDENT_DEGREES_OF_FREEDOM)
     weight *= row_interval_s / SECOND_DIFFERENCE_WINDOW_S
     horizontal_m = np.stack([source_second_difference_m, imu_second_difference_m])[..., :2]
@@ -653,7 +656,8 @@ def _compute_height_log_likelihood_ratio(
         * hypothesis.axis_permutation.vertical_sign
         * positions.position_m[:, hypothesis.axis_permutation.vertical_axis]
     )
-    # If the hypothesis is correct, down position + barometer height is constant
+    # If the hypothesis on the vertical axis is correct, down position + barometer height is
+    # constant. Medians remove the unknown origins
     error_m = down_m - np.median(down_m) + height_m - np.median(height_m)
     mean_square_error_m2 = np.mean(np.minimum(error_m**2, MAX_HEIGHT_ERROR_M**2))
     min_variance_m2 = BAROMETER_SIGMA_M**2

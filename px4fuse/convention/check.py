@@ -46,15 +46,16 @@ from .texts import format_axes, format_delay
 # Convention of a position source: axes, unit and delay. For the verdict "determined", the
 # log-likelihood (nats) of the best convention must exceed that of the second best by this value
 MIN_CONVENTION_LOG_ODDS = 4.0
-# The convention (axes, unit, delay) is not determinable if its log-likelihood (nats) exceeds that
-# of positions unrelated to the measured motion by less than this value
+# Null model: the positions are unrelated to the motion measured by the IMU. A convention (axes,
+# unit, delay) is not determinable if its log-likelihood gain (nats) over the null model is below
+# this value
 MIN_CONVENTION_LOG_LIKELIHOOD_GAIN = 8.0
-# A convention (axes, unit, delay) is compared with positions unrelated to the measured motion. It
-# is doubtful if its gain in log-likelihood (nats) per independent residual is below this value
+# A convention (axes, unit, delay) is doubtful if its log-likelihood gain (nats per independent
+# residual) over the null model (positions unrelated to the IMU motion) is below this value
 MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE = 0.15
-# If other conventions (axes, unit, delay) fit nearly as well, the best one is doubtful if its gain
-# in log-likelihood (nats) per independent residual, relative to positions unrelated to the measured
-# motion, is below this value
+# If other conventions (axes, unit, delay) fit nearly as well, the best one is doubtful if its
+# log-likelihood gain (nats per independent residual) over the null model (positions unrelated to
+# the IMU motion) is below this value
 MIN_LOG_LIKELIHOOD_GAIN_PER_SAMPLE_IF_AMBIGUOUS = 0.4
 # A convention (axes, unit, delay) is doubtful if the ratio of displacements in the positions to
 # displacements integrated from the IMU is outside these limits
@@ -322,6 +323,7 @@ def _judge_hypothesis(
 
 
 def _describe_hypothesis(hypothesis: Hypothesis) -> str:
+    """Describe axes, unit, rotation and delay of a hypothesis, for a list of alternatives."""
     properties = [format_axes(hypothesis.axes, hypothesis.unit)]
     if hypothesis.has_rotation:
         properties.append(
@@ -356,8 +358,8 @@ def _estimate_clock_drift(
 ) -> float:
     """Return the rate error (s/s) of the source's clock, or 0 if it is not significant.
 
-    A large drift hides the motion. If the best hypothesis on the axes fits badly, the search is
-    therefore repeated with several drifts.
+    With a large drift, no axes fit the motion. If the best axes fit badly, the search is therefore
+    repeated with a grid of drifts.
     """
     # If no hypothesis fits, a large clock drift may hide the motion: search a grid of drifts. Only
     # compare the unrefined candidates of each drift, because refining them would take too long
@@ -377,16 +379,15 @@ def _estimate_clock_drift(
         best_candidate, removed_drift = max(candidates_and_drifts, key=lambda pair: pair[0].score)
         start_hypothesis = replace(best_candidate, heading_from=best_hypothesis.heading_from)
         positions = positions.remove_clock_drift(removed_drift)
-    # Estimate the drift that is left
+    # Estimate the remaining clock drift, together with the other parameters
     hypothesis = refine_hypothesis(
         replace(start_hypothesis, has_clock_drift=True),
         positions,
         positions.compute_second_differences(imu_motion),
         imu_motion,
     )
-    # A small drift must increase the score significantly. After a drift from the grid was removed,
-    # no refined score without drift exists for comparison: determine_source_convention then tests
-    # the drift
+    # A drift must increase the score significantly. This test is not possible if a drift of the
+    # grid was removed, because start_hypothesis is then not refined. The caller tests such a drift
     if (
         not removed_drift
         and hypothesis.score <= start_hypothesis.score + MIN_LIKELIHOOD_GAIN_FROM_CLOCK_DRIFT
@@ -440,8 +441,8 @@ def _check_orientation(
         expected_x_axis_headings_deg = [90.0]
     else:
         expected_x_axis_headings_deg = [0.0, 90.0]
-    # Axes and unit are already determined: find the most likely rotation with them. The key "EKF2"
-    # means that the heading of the IMU motion does not drift
+    # The first hypothesis with the known axes and unit is the most likely one. With the key "EKF2",
+    # no heading drift is fitted
     for hypothesis in search_hypotheses(positions, {"EKF2": imu_motion}):
         if (
             hypothesis.has_rotation

@@ -121,8 +121,8 @@ def find_convention_faults(
         and convention.orientation is not None
         and orientation_fault != "copied"
     )
-    # - EKF2 did not fuse the source, and only the heading from the gyroscopes is available. It
-    #   drifts, so it shows wrong axes (multiples of 90°), but not a rotation
+    # Third case: EKF2 did not fuse the source, and the heading is from the gyroscopes. This heading
+    # drifts, so it reveals only wrong axes (multiples of 90°), but no smaller rotation
     has_no_heading_reference = uses_gyro_heading and not is_fused and not has_wrong_axes
     # - The frame of the positions is FRD, which has no fixed rotation from north
     if has_wrong_heading or is_heading_from_source or has_no_heading_reference or frame == "FRD":
@@ -147,8 +147,8 @@ def _find_axis_fault_and_rotation(convention: Convention) -> tuple[bool, float]:
     The axes are wrong if no rotation about the vertical makes them NED. The rotation is the one
     that remains after a conversion of wrong axes to NED; it is 0 if it is small.
     """
-    # A rotation about the vertical cannot make these axes NED. The fault is the nearest frame with
-    # axes along multiples of 90° from north; only a small rotation remains
+    # If a rotation about the vertical cannot make the axes NED, report the nearest frame with axes
+    # along north, east, south or west as the fault. Only a small rotation remains
     rotation_deg, is_z_up = convention.rotation_deg, convention.z == "up"
     is_enu_or_nwu = convention.axes in (FRAME_AXES["ENU"], FRAME_AXES["NWU"])
     if convention.is_mirrored or is_enu_or_nwu or convention.z not in ("up", "down"):
@@ -165,6 +165,7 @@ def _compute_angle_from_x_to_north_deg(convention: Convention) -> float:
 
 
 def _find_orientation_fault(convention: Convention) -> OrientationFault:
+    """Return the fault of the orientation that the source sends; "" if it is correct or unknown."""
     orientation = convention.orientation
     if orientation is None or orientation.verdict not in ("determined", "copied"):
         return ""
@@ -217,9 +218,8 @@ def convert_to_px4_convention(
 def _replace_attitude(flight: Flight, convention: Convention, faults: ConventionFaults) -> Flight:
     """Replace EKF2's attitude by that from the gyroscopes, if EKF2 fused wrong positions.
 
-    The heading of the new attitude must fit the frame of the positions. If neither axes nor
-    rotation of the positions were corrected, their x axis is used as north. The attitude is then
-    rotated by the detected angle from the x axis to north.
+    The heading of the new attitude refers to the frame of the positions: north if axes or rotation
+    of the positions were corrected, else their x axis.
     """
     inertial_data = integrate_inertial_data(flight) if faults.affects_ekf2 else None
     if inertial_data is None:
@@ -233,6 +233,7 @@ def _replace_attitude(flight: Flight, convention: Convention, faults: Convention
 
 
 def _make_matrix_to_ned_metres(convention: Convention, faults: ConventionFaults) -> Array:
+    """Return the 3×3 matrix that converts positions of the source to NED and metres."""
     metres_per_unit = METRES_PER_UNIT[convention.unit]
     if not faults.has_axes_to_correct:
         return metres_per_unit * np.eye(3)

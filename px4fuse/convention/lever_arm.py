@@ -67,9 +67,8 @@ def estimate_lever_arm(flight: Flight, track: PositionTrack) -> LeverArm | None:
     """Estimate the error of the lever arm in EKF2's parameters (true minus parameter).
 
     The lever arm in the parameters was already subtracted from the positions of ``track``. The
-    reference is ground truth. If ground truth gives no significant error, the IMU is the reference,
-    but not for GNSS. The estimate from the IMU also contains an error of EKF2_IMU_POS, with the
-    opposite sign. Return None if the error is not significant.
+    error is estimated with ground truth, or else with the IMU (not for GNSS). The estimate with the
+    IMU also contains the negative error of EKF2_IMU_POS. Return None for an insignificant error.
     """
     lever_arm = None
     if isinstance(flight.truth, Truth):
@@ -202,7 +201,8 @@ def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | No
         second_difference_error_m = source_motion.second_differences - imu_second_differences_m
         design_rows = design[is_used].reshape(-1, design.shape[2])
         valid_second_difference_errors_m = second_difference_error_m[is_used].ravel()
-        # Second differences with common positions are not independent. One spans 2 windows
+        # A second difference spans two windows. Differences closer than this are correlated and
+        # count as one
         independent_difference_count = (
             len(valid_second_difference_errors_m)
             * GRID_INTERVAL_S

@@ -226,7 +226,8 @@ def _level_attitude(attitude: Array, specific_force_m_s2: Array) -> Array:
     vertical = mean_specific_force_m_s2 / np.maximum(
         np.linalg.norm(mean_specific_force_m_s2, axis=1, keepdims=True), 1.0
     )
-    # For small tilt errors, the cross product is the rotation vector from this vertical to up
+    # For small tilt errors, the cross product is the rotation vector from the measured vertical to
+    # true up (0, 0, -1)
     levelling_rotation = from_rotation_vector(np.cross(vertical, [0.0, 0.0, -1.0]))
     return multiply(np.concatenate([levelling_rotation, levelling_rotation[-1:]]), attitude)
 
@@ -252,6 +253,7 @@ def high_pass(values: Array, is_valid: BoolArray) -> Array:
 
 
 def compute_second_differences(position: Array, window: int) -> Array:
+    """Return p(t + T) - 2 p(t) + p(t - T), with T of ``window`` rows; 2 · window rows are lost."""
     return position[2 * window :] - 2.0 * position[window:-window] + position[: -2 * window]
 
 
@@ -300,7 +302,7 @@ def filter_imu_motion(
 ) -> ImuSecondDifferences:
     """Apply a first-order low-pass filter to the second differences from the IMU.
 
-    These are the second differences of position that are integrated from the acceleration.
+    The derivatives with respect to the accelerometer bias are filtered, too.
     """
     previous_output_weight = np.exp(-GRID_INTERVAL_S / time_constant_s)
     table = imu_motion.table.copy()

@@ -73,9 +73,9 @@ class OrientationCandidate(NamedTuple):
 
     @property
     def order_and_frames_up_to_heading(self) -> tuple[str, str]:
-        """Quaternion order and frames, equal for conventions that differ only in heading.
+        """Quaternion order and frames; frames that differ only in heading are not distinguished.
 
-        The world frames ENU and NWU differ only in heading, so ENU is replaced by NWU.
+        For example, ENU and NWU differ only in heading, so ENU is replaced by NWU.
         """
         return self.convention.order, self.convention.frames.replace("ENU", "NWU")
 
@@ -186,8 +186,8 @@ def _score_convention(
     tilt_difference_deg, heading_difference_deg = np.degrees(
         np.median([tilt_difference_rad, heading_difference_rad], axis=1)
     ).tolist()
-    # Log likelihood: -(number of independent samples) · Σ ln(median difference). This number is
-    # proportional to the duration
+    # Log likelihood: -(number of independent samples) · (ln(median tilt difference) + ln(median
+    # heading difference)). The number of samples is proportional to the duration
     log_angle_differences = np.log(
         np.maximum([tilt_difference_deg, heading_difference_deg], ANGLE_DIFFERENCE_FLOOR_DEG)
     )

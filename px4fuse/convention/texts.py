@@ -31,17 +31,18 @@ def append_opposites(axes: AxisDirections) -> list[Direction]:
 def find_axes_in_file(axes: AxisDirections, frame: str) -> AxisDirections:
     """Return the true directions of the columns x, y, z of a position file.
 
+    The file was converted to NED from an assumed frame, which may be wrong.
+
     Parameters
     ----------
     axes : tuple of Direction
-        True directions of the file's positions, after conversion from ``frame`` to NED. If
-        ``frame`` is wrong, these directions are not north, east, down.
+        Directions in which x, y, z really point after the conversion from ``frame`` to NED. If
+        ``frame`` is correct, they are north, east, down.
     frame : str
-        Frame from which the positions were converted to NED, for example "ENU".
+        Assumed frame of the file, from which the positions were converted, for example "ENU".
     """
-    # If ``frame`` is correct, the axes x, y, z, -z, -y, -x of the converted positions point in
-    # DIRECTIONS. They really point in ``axes`` and their opposites. For example, a column that is
-    # up in ``frame`` becomes the -z axis, so its true direction is the opposite of axes[2]
+    # True direction of each assumed direction. For example, a column that is up in ``frame``
+    # becomes the -z axis of NED, so its true direction is the opposite of axes[2]
     true_directions = dict(zip(DIRECTIONS, append_opposites(axes), strict=True))
     x, y, z = (true_directions[name] for name in FRAME_AXES[frame])
     return x, y, z

@@ -83,6 +83,7 @@ def _list_folder(folder: Path) -> list[Path]:
 
 
 def _read_file_identity(path: Path) -> _FileIdentity | None:
+    """Return a value that is equal for all paths to one file; None if stat() fails on the path."""
     with suppress(OSError, ValueError):  # ValueError: a path that contains NUL
         status = path.stat()
         if status.st_ino:

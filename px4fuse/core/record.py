@@ -41,6 +41,7 @@ def one_line_repr(result: Any) -> str:
 
 
 def _format_value(value: Any) -> str:
+    """Format a value of a data class in a short form, by its type."""
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, str):
@@ -121,6 +122,7 @@ else:
         """
 
         def __class_getitem__(cls, member_types: tuple[type, type]) -> type:
+            """Return the type ``RecordOrUnavailable[A, B]``; objects of A and B are instances."""
             union_class = ABCMeta(
                 "Or".join(kind.__name__ for kind in member_types),
                 (),

@@ -49,6 +49,7 @@ class _Worker:
     def __init__(
         self, function: Callable[[Any], Any], max_memory_bytes: int | None, job_index: int
     ) -> None:
+        """Start a worker process for ``function``; ``job_index`` is the index of its first job."""
         # spawn works on all systems and does not copy the memory of this process
         context = multiprocessing.get_context("spawn")
         self.pipe, child_pipe = context.Pipe()
@@ -163,12 +164,12 @@ def poll_with_limits(
                         worker.is_ready = True
                         worker.send(jobs[worker.job_index], timeout_s)
                         continue
-                # 2. Its start or its job takes too long
+                # The start or the job of the worker exceeds its time limit
                 elif time.monotonic() >= worker.deadline:
                     is_usable = False
                     time_limit_s = timeout_s if worker.is_ready else WORKER_START_TIMEOUT_S
                     result = JobFailure(f"the job exceeded the time limit of {time_limit_s:g} s.")
-                # 3. It is still running
+                # The worker is still running
                 else:
                     continue
                 # The job is finished: use the worker process for the next job, or end it
@@ -199,6 +200,7 @@ def run_one_with_limits(
 
 
 def _receive_result(worker: _Worker) -> tuple[bool, Any]:
+    """Return the next message of a worker: a flag, and the result of its job."""
     try:
         message: tuple[bool, Any] = worker.pipe.recv()
     except (EOFError, OSError):
@@ -251,6 +253,7 @@ def _end_with_parent() -> None:
 
 
 def _limit_memory(max_memory_bytes: int | None) -> None:
+    """Limit the memory of this process (bytes; None: no limit), and disable core dumps."""
     try:
         import resource  # noqa: PLC0415 - not on Windows
     except ImportError:

@@ -68,6 +68,7 @@ def format_written_outputs(paths: Sequence[Path]) -> str:
 
 
 def _write_output(path: Path, content: bytes) -> None:
+    """Write the bytes to standard output, to a regular file, or to a named pipe or device."""
     if path == STANDARD_OUTPUT or _is_standard_output(path):
         sys.stdout.flush()
         sys.stdout.buffer.write(content)
@@ -87,6 +88,7 @@ def _is_standard_output(path: Path) -> bool:
 
 
 def _read_file_mode(path: Path) -> int:
+    """Return file type and permissions of a path; only the type "regular file" for a new file."""
     try:
         return path.stat().st_mode
     except FileNotFoundError:
@@ -94,6 +96,7 @@ def _read_file_mode(path: Path) -> int:
 
 
 def _replace_file(target: Path, content: bytes) -> None:
+    """Write a file completely or not at all: a temporary file replaces the target."""
     is_new_folder = not target.parent.exists()
     target.parent.mkdir(parents=True, exist_ok=True)
     # a short name, because the target name may have the maximum length
@@ -109,6 +112,7 @@ def _replace_file(target: Path, content: bytes) -> None:
 
 
 def _make_output_error(path: Path, error: OSError, written_files: Sequence[Path]) -> OutputError:
+    """Return the error for an output that cannot be written, with advice to the user."""
     output_name = "standard output" if path == STANDARD_OUTPUT else path
     faults = [f"{output_name} cannot be written ({error.strerror})"]
     if written_files:

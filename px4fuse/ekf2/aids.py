@@ -193,11 +193,13 @@ def evaluate_aids(flight: Flight) -> dict[str, AidResult] | Unavailable:
 
 
 def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> AidResult:
+    """Evaluate fusion and innovations of one aiding source between two times of the flight (s)."""
     samples = aid_log.samples.loc[start_s:end_s]
     sample_times_s = samples.index.to_numpy()
     gate = _find_applied_gate(aid, aid_log)
 
     def select_axis_columns(name: str) -> Array:
+        """Return the columns of a quantity, shape (samples, axes)."""
         return samples[[f"{name}_{axis}" for axis in aid_log.axes]].to_numpy()
 
     innovation, innovation_variance = map(select_axis_columns, ("innovation", "variance"))
@@ -381,6 +383,7 @@ def _find_longest_gap(fusion_times_s: Array, aid_log: AidLog, start_s: float, en
 
 
 def _classify_aid(axes: dict[str, AidAxisStatistics], is_gap_too_long: bool) -> AidVerdict:
+    """Return the verdict on an aiding source: the first fault found, or "consistent"."""
     if is_gap_too_long:
         return "not_fused"
     if not axes:

@@ -144,8 +144,11 @@ def _combine_barometer_samples(
 
     EKF2's logged height updates contain only some of the fused samples. Missing heights are taken
     from ``logged_down_m`` (barometer topic), or computed from the logged updates of the barometer
-    bias. The remaining gaps are filled with random heights that agree with EKF2's logged filtered
-    innovation.
+    bias. Heights that no topic contains cannot be recovered: they get random innovations that are
+    consistent with the low-pass filtered innovation in the log.
+
+    ``interval_s`` is the interval of the samples that EKF2 fused. Without logged height updates,
+    return ``logged_down_m``.
     """
     logged_updates = ekf2.aids[BAROMETER.name].samples
     if "observation_down" not in logged_updates or len(logged_updates) < 2:
@@ -168,11 +171,12 @@ def _combine_barometer_samples(
             logged_updates["observation_down"] - np.interp(row_times_s, bias_m.index, bias_m),
         ]
     )
-    # The grid has a place for each sample that EKF2 fused: one row per interval between two logged
-    # rows, one column per sample in the interval. The last sample is that of the logged row
+    # Length of each interval between two logged height updates, and number of samples that EKF2
+    # fused in it
     span_s = np.diff(row_times_s)
     sample_count = np.maximum(np.rint(span_s / interval_s), 1.0).astype(int)
-    # An interval is regular if it is a multiple of the sample interval. Others remain empty
+    # An interval is regular if its length is a multiple of the sample interval. The rows of other
+    # intervals remain empty (NaN)
     is_regular = (
         np.abs(span_s - sample_count * interval_s) < SAME_SAMPLE_TOLERANCE_IN_INTERVALS * interval_s
     )
@@ -209,8 +213,8 @@ def _combine_barometer_samples(
             # PX4 logs the filtered innovation with the opposite sign: state minus measurement
             -logged_updates["filtered_down"].to_numpy(),
         )
-    # Each sample of the grid has the height prediction + innovation. Logged heights between the
-    # times of the grid are added
+    # The height of a sample is the predicted measurement plus the innovation. Heights at other
+    # times are added unchanged
     has_sample = np.isfinite(innovation_m)
     grid_times_s = row_times_s[:-1, None] + sample_interval_by_row_s[:, None] * (sample_indices + 1)
     grid_times_s = grid_times_s[has_sample]
@@ -263,8 +267,9 @@ def _simulate_missing_innovations(
         scale=np.nanstd(innovation_m), size=innovation_m.shape
     )
     filled_innovation_m = np.where(is_missing, random_innovation_m, innovation_m)
-    # All random innovations of an interval are shifted by one offset, so that the computed f equals
-    # the logged f. The offset is their difference ÷ sum of the weights of the random innovations
+    # Shift all random innovations of an interval by one offset, so that the computed low-pass
+    # filtered innovation equals the logged one. The offset is the difference of the two filtered
+    # innovations ÷ sum of the weights of the random innovations
     filtered_innovation_error_m = (
         low_pass_filtered_innovation_m[1:]
         - previous_weight * low_pass_filtered_innovation_m[:-1]

@@ -68,6 +68,7 @@ class BadAccelerationFlag:
     def __init__(
         self, uses_logged_flag: BoolArray, flag_duration_s: float, segment: ReplaySegment
     ) -> None:
+        """Read the bad-acceleration flag that EKF2 logged in a segment."""
         time_s = segment.time_s
         logged_flag = segment.is_acceleration_bad
         if logged_flag is None:
@@ -87,7 +88,8 @@ class BadAccelerationFlag:
     def apply_logged_flag(self, now_s: Array) -> None:
         """Set ``since_s`` and ``until_s`` to the latest logged time with a set flag before now.
 
-        Only configurations that use the logged flag are changed.
+        ``now_s`` is the present time of each filter configuration, shape (filters,). Only
+        configurations that use the logged flag are changed.
         """
         if len(self.logged_spans_s):
             latest_row = np.searchsorted(self.logged_spans_s[:, 0], now_s) - 1
@@ -122,8 +124,9 @@ class BadAccelerationFlag:
         """
         *previous_barometer, previous_gnss = previous_innovations
         *barometer, gnss = innovations
-        # EKF2 tests the latest innovations of barometer and GNSS after each fusion. The first test
-        # uses the last samples of the previous event
+        # After each fusion, EKF2 tests the latest barometer and GNSS innovations for a bad
+        # acceleration. The first test uses the last barometer and GNSS samples of the previous
+        # event
         latest_barometer_innovation = np.full_like(gnss, np.nan)
         for sample in previous_barometer:
             latest_barometer_innovation = np.where(
@@ -151,7 +154,7 @@ class BadAccelerationFlag:
 
 
 def _has_large_height_innovations(barometer_innovation: Array, gnss_innovation: Array) -> BoolArray:
-    """Return True if both height innovations are large: EKF2 then assumes that it is falling.
+    """Return True if both height innovations are large: EKF2 then assumes a falling vehicle.
 
     The innovations are normalised (√S) and positive upwards (PX4: ``vert_innov_test``).
     """
@@ -194,6 +197,7 @@ class HeightFilter:
         gnss_down_m: Array,
         bad_acceleration_flag: BadAccelerationFlag,
     ) -> None:
+        """Collect the height samples of all fusion events, and set noise, gates and bias."""
         self.bad_acceleration_flag = bad_acceleration_flag
         segment, parameters = batch.segment, batch.parameters
         height_samples = segment.height_samples
@@ -215,8 +219,8 @@ class HeightFilter:
         )
         # Index of the GNSS sample, after the barometer samples of each event
         self.gnss_index = barometer_samples.shape[1]
-        # GNSS is the last sample of each event. Its age is 0, because the event is at its
-        # measurement time
+        # Append one GNSS sample to the barometer samples of each event. Its age is 0, because a
+        # fusion event is at the measurement time of the GNSS sample
         self.down_m, self.age_s, self.time_s, self.dead_zone_m, weight, has_sample = np.pad(
             barometer_samples, ((0, 0), (0, 1), (0, 0), (0, 0))
         )
@@ -313,7 +317,8 @@ class HeightFilter:
             self.last_sample_s = np.where(
                 has_sample, np.maximum(previous_sample_s, time_s), previous_sample_s
             )
-            # Without the reference, EKF2 holds the bias constant
+            # While the height reference is disabled, EKF2 holds the bias of the other sensor
+            # constant
             is_bias_updated = has_sample & self.is_reference_enabled[event]
             interval_s = (self.last_sample_s - previous_sample_s) * is_bias_updated
             nu, R = self.bias.remove_and_update_bias(

@@ -373,6 +373,7 @@ def compute_lost_imu_fraction(time_s: Array) -> float:
 
 
 def _explain_missing_imu(time_s: Array) -> Unavailable | None:
+    """Return Unavailable if the log contains too few IMU samples for an EKF2 replay, else None."""
     median_interval_s = compute_median_interval_s(time_s)
     if median_interval_s > MAX_IMU_INTERVAL_S:
         return Unavailable(
@@ -390,6 +391,7 @@ def _explain_missing_imu(time_s: Array) -> Unavailable | None:
 
 
 def _make_fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules:
+    """Return EKF2's rules for position fusion in the PX4 release of the log."""
     fusion_rules, parameters = VISION_RULES, fusion_record.parameters
     if is_gnss:
         # PX4 with EKF2_GPS_MODE (main of 2026) does not reset velocity with position
@@ -601,9 +603,9 @@ def _read_logged_decisions(
     earliest_fusion_times_s = np.maximum.accumulate(
         np.maximum(measurement_times_s, arrival_s - horizon_s)
     )
-    # EKF2 rejected the samples of two kinds of time span, except the last sample of each. The first
-    # kind is from EKF2's last fusion (last_fused_s) to the log row with this value. The second is
-    # dead reckoning, which its last sample ended
+    # EKF2 fused no sample between its last fusion (last_fused_s) and the log row that contains this
+    # time. It also fused none during dead reckoning. The last sample of each of these time spans is
+    # excluded: its decision is in the log row, or it ended dead reckoning
     last_fused_s = ekf2.aids[aid.name].samples.reindex(columns=["last_fused_s"]).dropna()
     fusion_to_log_row_s = np.column_stack([last_fused_s, last_fused_s.index])
     dead_reckoning_s = _find_dead_reckoning_spans(ekf2, fusion_record, aid)
@@ -633,14 +635,14 @@ def _read_logged_decisions(
         )
         reset_rows = np.flatnonzero(is_published_near_reset & may_be_reset_sample)
         rows_after_dead_reckoning = np.intersect1d(reset_rows, dead_reckoning_rows[:, 1] - 1)
-        # If a possible reset sample ended dead reckoning, EKF2 reset its position to it. Otherwise,
-        # EKF2 reset its position to the newest possible sample
+        # EKF2 reset its position to the candidate that ended dead reckoning. If no candidate ended
+        # dead reckoning, EKF2 reset its position to the newest candidate
         if len(rows_after_dead_reckoning):
             is_reset[rows_after_dead_reckoning[0]] = True
         elif len(reset_rows):
             is_reset[reset_rows[-1]] = True
-    # A time span of the first kind starts when EKF2 fuses a sample. This sample, one row before the
-    # first row of the span, is therefore not rejected
+    # EKF2 fused the sample before each span that starts at last_fused_s. Set its rejection to 0,
+    # unless another decision on it is already known
     rows_after_fusion = fusion_to_log_rows[:, 0]
     fused_rows = rows_after_fusion[rows_after_fusion > 0] - 1
     is_undecided = ~is_reset[fused_rows] & np.isnan(rejected_flags[fused_rows])

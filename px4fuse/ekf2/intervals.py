@@ -54,7 +54,7 @@ BY_ATTITUDE_CORRECTION, BY_ACCELERATION = 9, 10
 FusionEvents = np.recarray[Any, Any]
 EVENT_DTYPE = np.dtype(
     [
-        ("end_step", np.intp),  # prediction step of the event
+        ("end_step", np.intp),  # number of prediction steps from the start to the event
         ("sample", np.intp),  # index of the position sample, -1 without a sample
         ("action", np.intp),
         ("usable", bool),  # True if the sample arrived in time
@@ -90,7 +90,7 @@ class EventIntervals:
     def compute_transitions(self, rows: slice) -> tuple[Array, ...]:
         """Return transition and process noise of the motion state in E intervals between fusions.
 
-        The other states are constant.
+        The other states are constant. ``rows`` selects the intervals.
 
         Returns
         -------
@@ -156,6 +156,7 @@ def make_event_intervals(
 def _make_fusion_events(
     inputs: ReplayInputs, segment: ReplaySegment, delays: FusionDelays
 ) -> FusionEvents:
+    """Return the fusion events of a segment in time order, see EVENT_DTYPE."""
     received_positions = inputs.received_positions
     time_s = segment.time_s
     # Find the prediction step in which EKF2 fuses each sample
@@ -193,9 +194,9 @@ def _make_fusion_events(
     event_row_by_sample = np.cumsum(event_counts_in_gaps[:-1] + 1) - 1
     event_count = len(timestamp_s) + int(event_counts_in_gaps.sum())
     events = np.zeros(event_count, EVENT_DTYPE).view(np.recarray)
-    # The events divide a gap into equal numbers of prediction steps, so their steps are
-    # interpolated between those of the samples. Row -1 is the start of the segment, row event_count
-    # its end
+    # The events in a gap are evenly spaced: interpolate their prediction steps between those of the
+    # samples before and after the gap. Row -1 is the start of the segment, row event_count is its
+    # end
     events.end_step = np.rint(
         np.interp(
             np.arange(event_count),
@@ -259,8 +260,13 @@ def _integrate_state_jacobian(
 ) -> Array:
     """Return the derivatives of the motion state at the end of each interval.
 
-    Rows: attitude error, velocity and position. Columns: see DERIVATIVE_COLUMN_COUNT. The
-    derivatives follow the prediction step at the top of this module.
+    The shape is (intervals, 9, DERIVATIVE_COLUMN_COUNT). Rows: attitude error, velocity and
+    position. Columns: attitude error, gyro bias and accelerometer bias at the start of the
+    interval; change of the state by EKF2's attitude correction; change by the measured
+    acceleration.
+
+    Intervals are given by their first prediction step and their number of steps. The derivatives
+    follow the prediction step at the top of this module.
     """
     # All intervals are integrated together, step by step. Sorted by length, longest first, the
     # intervals that have not ended are always the first rows

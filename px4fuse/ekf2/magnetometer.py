@@ -51,6 +51,7 @@ def average_by_event(
     mean_count_by_event = np.maximum(np.bincount(event_index, minlength=row_count), 1)
 
     def mean(values: Array) -> Array:
+        """Return the mean of the values of each event."""
         sum_by_event = np.zeros((row_count, *values.shape[1:]))
         np.add.at(sum_by_event, event_index, values)
         return (sum_by_event.T / mean_count_by_event).T[:-1]
@@ -59,11 +60,12 @@ def average_by_event(
         mean, (sensor_samples.value, sensor_samples.ned_to_body_rotation, sensor_samples.noise)
     )
     if VELOCITY in sensor_samples.state_slices:
-        # The IMU velocity change up to the time of each sample was subtracted from optical flow.
-        # Add the change up to the event: the mean is then a velocity at the event
+        # Each optical flow sample is a velocity without the velocity change measured by the IMU up
+        # to the time of the sample. Add the velocity change up to the fusion event, so that the
+        # mean is a velocity at the time of this event
         velocity_m_s = segment.imu_velocity_change_m_s[event_end_steps]
         value = value + np.einsum("eab,eb->ea", ned_to_body_rotation, velocity_m_s)
-    # Each of ``sensor_samples`` may itself be the mean of several EKF2 samples: add their numbers
+    # Each sample may be a mean of several EKF2 samples: add their sample counts
     sample_count = np.bincount(event_index, sensor_samples.sample_count, row_count)[:-1]
     return EventSamples(
         value, ned_to_body_rotation, np.asarray(sample_count, float), noise_variance

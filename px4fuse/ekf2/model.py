@@ -135,11 +135,12 @@ def prepare_ekf2_model(
             break
         for name in failed_aids:
             omitted_aids[name] = agreement.doubtful[name]
-            # The agreement of optical flow is one number, that of other sources is by axis
+            # The field with the agreement of replay and log has the name of the source. For optical
+            # flow, it is the largest position difference
             field_name = "carried_difference_m" if name == FLOW.name else name
             fields_of_omitted_aids[field_name] = getattr(agreement, field_name)
-    # With many rejections, replay and EKF2 may reject different samples: compare a replay with the
-    # logged rejections instead
+    # If many samples are rejected, replay and EKF2 may reject different samples. Then a replay that
+    # rejects the same samples as EKF2 is compared with the log
     if (
         max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
         > MAX_REJECTED_FRACTION_FOR_COMPARISON
@@ -366,6 +367,7 @@ def _make_delayed_track(run: SegmentRun, state: Array) -> pd.DataFrame:
 def _run_model(
     model: Ekf2Model, configurations: Sequence[FilterConfiguration]
 ) -> Sequence[SegmentRun]:
+    """Return the stored runs if they contain all these configurations; otherwise run them."""
     if model.runs and all(
         configuration in model.runs[0].configurations for configuration in configurations
     ):
@@ -406,6 +408,7 @@ def _make_replay(
     configuration: FilterConfiguration,
     changed_parameters: Mapping[str, float],
 ) -> Ekf2Replay:
+    """Join the results of one filter configuration in all flight segments."""
     configuration_index = runs[0].configurations.index(configuration)
     fusion_horizon_tracks, published_tracks = zip(
         *(_make_state_tracks(inputs, run, configuration_index) for run in runs), strict=True
@@ -553,7 +556,7 @@ def compute_delayed_states(run: SegmentRun, configuration_index: int) -> Array:
         states[block_first_steps[0] + 1 : block_first_steps[-1] + 1] = _propagate_states(
             run, configuration_index, event_states[first_event:], block_first_steps
         )
-    # The last step of an interval ends with an event: the state after the fusion
+    # The state at the prediction step of an event is the state after the fusion of the event
     states[event_steps] = event_states[1:]
     return states
 
@@ -587,8 +590,9 @@ def _propagate_states(
     def integrate(rows: slice, increments: Array) -> ArrayPair:
         """Return the state elements ``rows`` before and after each prediction step.
 
-        In each interval, they are the state after the fusion plus the sum of the increments since
-        then. That sum is the sum from the first step on, minus its value at the fusion.
+        ``increments`` are their changes in the steps. In each interval, the state is the state
+        after the last fusion plus the sum of the increments since that fusion. This sum is a
+        difference of two cumulative sums.
         """
         sums = cumulative_sums(increments)
         sums_at_fusions = sums[first_steps[:-1] - first_steps[0]]

@@ -119,10 +119,12 @@ def sum_attitude_corrections(
 ) -> Array:
     """Return the sum of the output predictor's attitude corrections (rad) after each step.
 
-    ``error_rad``, shape (n + 1, 3), is the attitude error at the fusion horizon.
+    ``error_rad``, shape (n + 1, 3), is the attitude error at the fusion horizon without
+    corrections. ``lag_steps`` is the number of prediction steps L from the fusion horizon to the
+    present.
 
-    Each step corrects the newest attitude by a fraction g of the error at the fusion horizon, of
-    which the corrections c up to that time are already removed. With L = ``lag_steps``:
+    Each step adds a correction of g · (error at the fusion horizon - sum of the corrections at the
+    fusion horizon). With the sum c and the gain g:
 
         c_k - c_(k-1) + g c_(k-L-1) = g error_(k-L-1)
     """

@@ -62,8 +62,8 @@ FLOW_PROPERTY_NAME = "optical flow"
 VISION_PROPERTY_NAME = "external vision"
 REJECTION_PROPERTY_NAME = "rejections and resets"
 OUTPUT_PREDICTOR_PROPERTY_NAME = "output predictor"
-# EKF2 fuses aiding sources that KF does not fuse. The fusion of each source is a property in which
-# KF and EKF2 differ. The key is PX4's name of the source
+# Names of the properties for optical flow and additional external vision, which KF does not fuse.
+# The keys are PX4's names of the sources
 REPLACEMENT_NAME_BY_ADDITIONAL_AID = {
     FLOW.name: FLOW_PROPERTY_NAME,
     EV_POS.name: VISION_PROPERTY_NAME,
@@ -163,7 +163,7 @@ class DifferenceExplanation(Record, kw_only=True):
 
     @property
     def unexplained_fraction(self) -> float:
-        """Fraction of the mean square position difference that no replacement explains."""
+        """Mean square position difference after all replacements ÷ that before all replacements."""
         return self.unexplained_mean_square_m2 / self.position_mean_square_m2
 
 
@@ -261,9 +261,11 @@ def _explain_difference_along_axis(
     spans_s: Spans,
     longest_rejection: RejectionSeries | None,
 ) -> DifferenceExplanation:
-    """Divide the mean square difference KF - EKF2 along one axis among the replaced properties.
+    """Attribute the mean square difference KF - EKF2 along one axis to properties of KF.
 
-    Each state contains position and velocity at n times, shape (2, n).
+    Properties of KF, such as the measurement noise, were replaced by those of EKF2, one after the
+    other. A property explains the reduction of the mean square difference by its replacement. Each
+    state contains position and velocity at n times, shape (2, n).
 
     Parameters
     ----------

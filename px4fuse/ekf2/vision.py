@@ -119,8 +119,8 @@ class VisionFilter:
         self.update_records = np.full((event_count, sample_count, 7, configuration_count), np.nan)
         self.position_reset_m = np.zeros((event_count, configuration_count, 2))
         has_sample = (sample_flags > 0.0) & is_enabled_by_aid[EV_POS.name]
-        # Vision samples before the GNSS sample of an event, and vision samples in the same
-        # prediction step (age 0), which EKF2 fuses after GNSS
+        # Element 0: samples of prediction steps before the event. Element 1: samples of the
+        # prediction step of the event (age 0), which EKF2 fuses after GNSS
         self.has_sample = [has_sample & (self.age_s > 0.0), has_sample & (self.age_s == 0.0)]
         self.has_gate = batch.has_gate
         self.is_gnss_off = ~is_enabled_by_aid[GNSS_POS.name]
@@ -170,7 +170,8 @@ class VisionFilter:
         Sources: ``ev_pos_control.cpp``, functions controlEvPosFusion and updateEvPosFusion.
         """
         is_gnss_off = self.is_gnss_off[event]
-        # Fuse the first sample of each configuration in this event, then the second, and so on
+        # Loop over the samples of this event. In each iteration, every filter configuration fuses
+        # at most one sample
         for sample_index, has_sample in enumerate(self.has_sample[is_after_gnss_fusion][:, event]):
             if not has_sample.any():
                 continue

@@ -80,8 +80,9 @@ MAX_REJECTED_SAMPLE_FRACTION = 0.35
 # EKF2 resets the height after this time (s) without height fusion (hgt_fusion_timeout_max,
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
-# EKF2 is not predictable if the ratio of largest to smallest mean NIS exceeds this value in replays
-# with different added position noise
+# Maximum ratio of largest to smallest mean NIS in replays that differ only in the random noise
+# added to the positions. Above this ratio, EKF2 is not predictable: very small changes of the
+# positions change its statistics
 MAX_NIS_RATIO_BETWEEN_REPEATED_REPLAYS = 1.10
 # EKF2 is not predictable if the rejected fractions of samples differ by more than this value
 # between replays with different added position noise
@@ -389,6 +390,7 @@ def _is_ratio_below(max_ratio: float, values: Sequence[float]) -> bool:
 
 
 def _summarise_replay(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf2Statistics:
+    """Return statistics of a replay in the evaluated time spans."""
     updates = replay.updates
     evaluated_updates = rows_inside(updates, spans_s)
     update_times_s = updates["fused_at_s"]
@@ -431,6 +433,7 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf
 
 
 def _summarise_log(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Ekf2Statistics:
+    """Return statistics of EKF2 in the log, in the evaluated time spans."""
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     evaluated_updates = rows_inside(logged_innovations(ekf2), spans_s)
@@ -516,6 +519,7 @@ def _make_summary(
         return NO_TRUTH if rmse_to_truth is None else rmse_to_truth
 
     def summarise_axis(axis: NedAxis, direction: Array) -> AxisStatistics:
+        """Return the statistics of the position source along one axis."""
         median_sigma: float | Unavailable
         if isinstance(ekf2.variance, Unavailable):
             median_sigma = ekf2.variance
@@ -557,12 +561,14 @@ def _make_summary(
 def _compute_innovation_statistics(
     updates: pd.DataFrame, *axes: NedAxis
 ) -> tuple[float, tuple[float, float], float]:
+    """Return mean NIS, its band, and innovation standard deviation (m) of several axes together."""
     nu = np.concatenate([updates[f"innovation_{axis}_m"] for axis in axes])
     S = np.concatenate([updates[f"innovation_variance_{axis}_m2"] for axis in axes])
     return float(np.mean(nu**2 / S)), compute_nis_band(len(nu)), float(np.std(nu))
 
 
 def _summarise_aid(evaluated_updates: pd.DataFrame, spans_s: Spans) -> AidStatistics:
+    """Return innovation statistics of one aiding source, all axes together."""
     fused_updates = evaluated_updates[evaluated_updates["rejected"] == 0.0]
     longest_gap_s = max(
         _find_longest_gap_s(rows_inside(fused_updates, (span,)).index, (span,)) for span in spans_s
@@ -596,6 +602,7 @@ def _compute_heading_error_deg(
 
 
 def _find_longest_gap_s(fusion_times_s: ArrayLike, spans_s: Spans) -> float:
+    """Return the longest time (s) without fusion."""
     span_limits_s = [spans_s[0][0], spans_s[-1][1]]
     return float(np.diff(np.sort(np.append(span_limits_s, fusion_times_s))).max())
 
@@ -638,6 +645,7 @@ def _describe_deviation(
 
 
 def _describe_replay_limits(model: Ekf2Model, replay: Ekf2Replay) -> Iterator[str]:
+    """Yield texts for the user about the limits of one replay with changed parameters."""
     # 1. Effects of the changed parameters
     min_noise_m = replay.settings.get(GNSS_POS.noise, 0.0)
     if EV_POS.noise in replay.changed_parameters and (

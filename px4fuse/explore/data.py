@@ -38,7 +38,7 @@ PageData = dict[str, Any]
 OFFSET_SLIDER_HALF_RANGE_S = 0.6
 # Rounding steps per unit (m, m/s or s) for the inputs of KF; integers compress well
 KF_INPUT_ROUNDING_STEPS_PER_UNIT = 2.0**36
-# Rounding steps per unit for values that are only drawn or averaged
+# Values that are only drawn or averaged are rounded to 1 ÷ this number
 DRAWN_VALUE_ROUNDING_STEPS_PER_UNIT = 1e6
 # Limit of the rounded values: JavaScript represents integers exactly up to twice this limit
 MAX_EXACT_INTEGER = 2.0**52
@@ -68,6 +68,7 @@ class ArrayEncoder:
         return {"array": len(self._encoded_arrays) - 1}
 
     def add_times(self, time_s: Array) -> dict[str, int]:
+        """Add times (s); whole microseconds, as in PX4 logs, are stored without rounding."""
         has_whole_microseconds = bool(np.all(np.abs(np.rint(time_s * 1e6) / 1e6 - time_s) < 1e-10))
         return self.add(time_s, 1e6 if has_whole_microseconds else KF_INPUT_ROUNDING_STEPS_PER_UNIT)
 
@@ -143,8 +144,7 @@ def _make_imu_data(comparison: Comparison, encoder: ArrayEncoder) -> PageData | 
     return {
         "time": encoder.add_times(time_s),
         "gapEdges": gap_bounds_s.ravel().tolist(),
-        # Total duration at the start and at the end of each gap: each total applies from the end of
-        # a gap to the start of the next gap
+        # Total gap length (s) at each gap edge. It is constant between gaps, and linear in a gap
         "gapSum": np.repeat(total_gap_duration_s, 2)[1:-1].tolist(),
     }
 
@@ -171,6 +171,7 @@ def _make_axis_inputs(axis: Axis, source_track: PositionTrack, encoder: ArrayEnc
 
 
 def _make_axis_data(analysis: Analysis, result: AxisComparison, encoder: ArrayEncoder) -> PageData:
+    """Return the results along one axis for the page: NIS bands, EKF2 and ground truth."""
     name, whole_flight = result.axis.name, result.with_whole_flight_tracks()
     return {
         "note": result.axis.note,
@@ -196,6 +197,7 @@ def _pack_nis_bands(innovation_count: int, encoder: ArrayEncoder) -> list[dict[s
 
 
 def _make_ekf2_data(result: AxisComparison, encoder: ArrayEncoder) -> PageData | None:
+    """Return state, σ and innovations of EKF2 along one axis; None if EKF2 is not logged."""
     ekf2, summary = result.ekf2_tracks, result.filters["ekf2"]
     if isinstance(ekf2.state, Unavailable):
         return None
@@ -233,6 +235,7 @@ def _make_ekf2_data(result: AxisComparison, encoder: ArrayEncoder) -> PageData |
 
 
 def _make_truth_data(result: AxisComparison, encoder: ArrayEncoder) -> PageData | None:
+    """Return position and velocity of the ground truth; None if the log contains none."""
     if isinstance(result.truth, Unavailable):
         return None
     position_m, velocity_m_s = (

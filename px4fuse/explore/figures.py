@@ -103,6 +103,8 @@ def select_plots(data: PageData) -> dict[str, Plot]:
 
 
 def _make_plot(name: str, plot: Plot, data: PageData, shared_time_range: Range1d) -> Any:
+    """Make the plot ``name`` over time; JavaScript fills its data sources."""
+    # Data source of the plot by its short name; the first call makes the source
     get_source = cache(lambda source: _make_data_source(f"{name}:{source}"))
     plot_figure: Any = figure(
         name=name,
@@ -154,6 +156,7 @@ def _make_plot(name: str, plot: Plot, data: PageData, shared_time_range: Range1d
 
 
 def _draw_innovations(plot_figure: Any, get_source: Callable[[str], ColumnDataSource]) -> None:
+    """Draw the innovations ÷ √S of KF and EKF2, and the band of consistent innovations."""
     plot_figure.y_range = Range1d(
         start=-INNOVATION_AXIS_LIMIT_IN_SQRT_S, end=INNOVATION_AXIS_LIMIT_IN_SQRT_S
     )
@@ -179,7 +182,8 @@ def _draw_innovations(plot_figure: Any, get_source: Callable[[str], ColumnDataSo
 
 
 def _add_hover(plot_figure: Any, renderer: Any, label: str, value: str) -> None:
-    # place tooltips on different sides, so that they do not overlap
+    """Add a tooltip with time and value; ``value`` is the value's column and format in Bokeh."""
+    # Place tooltips on different sides, so that they do not overlap
     side: Any = {"EKF2": "right", "ground truth": "above"}.get(label, "left")
     tooltip_rows = [("time", "@t{0.00} s"), (label, value)]
     plot_figure.add_tools(
@@ -188,6 +192,7 @@ def _add_hover(plot_figure: Any, renderer: Any, label: str, value: str) -> None:
 
 
 def _make_data_source(name: str) -> ColumnDataSource:
+    """Make an empty data source with all columns, which JavaScript finds by its name."""
     return ColumnDataSource(
         {column: [] for column in BOKEH_SOURCE_COLUMNS.split()}, name=f"{name}-source"
     )

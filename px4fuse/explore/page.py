@@ -30,6 +30,7 @@ ASSET_PACKAGE = "px4fuse.explore"
 
 
 def make_analysis_page(analysis: Analysis) -> str:
+    """Make the interactive page with the analysis of one flight (HTML)."""
     encoder = ArrayEncoder()
     data, card = make_flight_data(analysis, encoder), make_diagnosis_card(analysis)
     description = card.identity

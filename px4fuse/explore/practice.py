@@ -132,7 +132,10 @@ def choose_random_flights(seed: int, level: int, count: int) -> tuple[QuizFlight
 
 
 def _draw_flight(rng: np.random.Generator, right_answer: str, level: int) -> QuizFlight:
+    """Choose a random flight of the quiz: its faults with their sizes, and its scenario."""
+
     def draw_one_fault(candidates: list[QuizFault]) -> list[QuizFault]:
+        """Return a list with one random candidate; empty without candidates."""
         return [candidates[rng.integers(len(candidates))]] if candidates else []
 
     faults = draw_one_fault([fault for fault in QUIZ_FAULTS if fault.choice == right_answer])
@@ -174,7 +177,7 @@ def make_practice_page(
         data, flight_html = _simulate_flight_data(practice_flight, flight_index)
         flights_html += flight_html
     return make_page_html(
-        data,  # plots and axes of the last flight, which are the same for all flights
+        data,  # plots and axes are equal for all flights: take those of the last
         data_scripts=flights_html,
         command="practice",
         title="simulated flights with known faults",
@@ -215,6 +218,7 @@ def _simulate_flight_data(
 
 
 def _describe_fault(fault: QuizFault, size: str, findings: tuple[Finding, ...]) -> dict[str, Any]:
+    """Describe a fault for the solution: name, size, time, symptom, and the plot that shows it."""
     finding_id = FINDING_ID_BY_FAULT.get(fault.name)
     spans = [span for finding in findings if finding.id == finding_id for span in finding.spans_s]
     time_text = f"{spans[0][0]:.1f} to {spans[-1][1]:.1f} s" if spans else "whole flight"
@@ -239,6 +243,7 @@ def split_fault_size(size: str) -> list[str]:
 def _with_fault_headline(
     card: DiagnosisCard, fault_descriptions: Sequence[Mapping[str, Any]]
 ) -> DiagnosisCard:
+    """Replace the headline of a diagnosis card by the injected faults, which were not detected."""
     if card.causes or not fault_descriptions:
         return card
     fault_text = "; ".join(f"{fault['fault']}: {fault['size']}" for fault in fault_descriptions)

@@ -199,6 +199,7 @@ def classify_mean_nis(nis_mean: float, nis_band: Limits) -> SigmaVerdict:
 
 
 def _compute_nis_verdict_fields(nis: Array, dimension_count: int = 1) -> dict[str, Any]:
+    """Return count, mean NIS, its 95 % band, σ ratio and verdict from NIS values."""
     nis_mean = float(np.mean(nis)) / dimension_count
     mean_nis_band = compute_nis_band(len(nis), dimension_count)
     return {

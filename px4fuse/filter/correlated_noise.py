@@ -57,8 +57,8 @@ MAX_SIGMA_Z_OF_LOW_PASS_SOURCE_M = 0.01
 # Minimum log-likelihood gain of time-correlated noise over white noise, to report time-correlated
 # noise
 MIN_LIKELIHOOD_GAIN_NATS = 2.0
-# Reduction (nats) of the log-likelihood of a noise fit that also estimates a time offset: one more
-# parameter (Akaike 1974)
+# Reduction (nats) of the log-likelihood of a noise fit if it also estimates a time offset. The
+# Akaike information criterion (1974) deducts 1 nat for one more parameter; this is twice as much
 TIME_OFFSET_PENALTY_NATS = 2.0
 # Search range (s) of the time constant of a low-pass filter in the source
 LOW_PASS_TAU_RANGE_S = (0.02, 3.0)
@@ -187,8 +187,8 @@ def _fit_low_pass(
         """Return -ln p and the estimated SIGMA_Z for a time constant of the filter."""
         # -ln p of the measured positions = -ln p of the unfiltered positions - ln |Jacobian|
         motion, minus_log_jacobian = undo_low_pass(float(np.exp(log_tau)))
-        # The times of the positions are the same for each τ. fit_time_correlation has computed the
-        # IMU motion at these times before
+        # The IMU motion at these times is already known: fit_time_correlation has computed it, and
+        # the times do not depend on the time constant τ
         assert not isinstance(motion, Unavailable)
         fit = motion.fit_noises(0.0, start_parameters)
         return fit.compute_score() + minus_log_jacobian, fit.noise_parameters.sigma_z_m
@@ -339,11 +339,21 @@ def fit_time_correlation_to_truth(
 ) -> TimeCorrelatedNoise | Unavailable:
     """Fit time-correlated noise to the position errors against ground truth.
 
-    Frame errors and time offsets are removed from the errors. ``correlated_noise_from_imu`` is
-    returned if its log-likelihood gain over white noise is larger.
+    Frame errors and time offsets are removed from the errors. ``correlated_noise_from_imu``, the
+    estimate without ground truth, is returned in these cases: there are too few positions near
+    ground truth, ground truth is a copy of the positions, or the log-likelihood gain over white
+    noise is below that of ``correlated_noise_from_imu`` or below MIN_TRUTH_LIKELIHOOD_GAIN_NATS.
 
-    Model: the covariance of the errors is σ² ((1 - f) I + f C), with C = exp(-|Δt| / τ). For each
-    tested τ and f, the most likely σ² is known in closed form.
+    Model: the covariance of the errors is σ² ((1 - f) I + f C), with C = exp(-|Δt| / τ) and the
+    fraction f of time-correlated noise in the variance. For each tested τ and f, the most likely σ²
+    is known in closed form.
+
+    Parameters
+    ----------
+    axes, truths
+        Axes with the same measurement times, and ground truth of each axis (``position_m``).
+    clock_offset_s : float
+        Time offset (s) that is added to the timestamps of the positions.
     """
     min_likelihood_gain_nats = MIN_TRUTH_LIKELIHOOD_GAIN_NATS
     low_pass_gain_nats = low_pass.gain_nats
@@ -400,9 +410,11 @@ def fit_time_correlation_to_truth(
     # Compute the log-likelihood for each τ and each fraction f of time-correlated noise
     @cache
     def compute_scores_and_variances(tested_tau_s: float) -> ArrayPair:
-        """Return -ln p and the most likely σ² for each tested fraction f.
+        """Return -ln p and the most likely σ² for each tested fraction f of time-correlated noise.
 
-        In the eigenvectors of C, the covariance is diagonal for all f: σ² (1 - f + f · eigenvalue).
+        C is the correlation matrix of the projected errors for ``tested_tau_s``. In the basis of
+        the eigenvectors of C, the covariance is diagonal for all f: σ² (1 - f + f · eigenvalue).
+        σ² is fitted to each axis; the returned σ² is the mean over the axes.
         """
         correlation_matrix = (
             basis_without_systematic_errors.T
@@ -460,6 +472,7 @@ def fit_time_correlation_to_truth(
 def _fit_noises_at_best_offset(
     imu_motion: PositionsAndImuMotion, offsets_s: Sequence[float], start_parameters: NoiseParameters
 ) -> tuple[NoiseFit, float]:
+    """Fit the noises with each time offset; return the most likely fit and its offset (s)."""
     fits = [(imu_motion.fit_noises(offset_s, start_parameters), offset_s) for offset_s in offsets_s]
     return min(fits, key=lambda fit_and_offset: fit_and_offset[0].compute_score())
 

@@ -38,7 +38,7 @@ SIGMA_Z_SEARCH_RANGE_M = (1e-3, 10.0)
 MAX_OUTLIER_ITERATIONS = 12
 # Maximum number of L-BFGS-B iterations of a fit
 MAX_FIT_ITERATIONS = 50
-# Number of iterations to estimate the outlier probabilities if the noises are given
+# Number of iterations that estimate the outlier probabilities for given SIGMA_A and SIGMA_Z
 OUTLIER_ITERATIONS_WITH_GIVEN_NOISES = 3
 # Minimum ratio of the outliers' σ to SIGMA_Z
 MIN_OUTLIER_SIGMA_RATIO = 3.0
@@ -121,6 +121,7 @@ class NegativeLogLikelihood:
         measurement_weights: Array,
         sigma_z_m: float,
     ) -> None:
+        """Prepare the two-dimensional grid on which -ln p is interpolated."""
         self.positions_by_axis = positions_by_axis
         self.measurement_weights = measurement_weights
         # The grid requires that a common factor on SIGMA_A and SIGMA_Z scales all covariances. This
@@ -143,7 +144,10 @@ class NegativeLogLikelihood:
 
         @cache
         def compute_scores_at_nodes(ratio_index: int, first_sigma_z_index: int) -> Array:
-            """Return -ln p at the ratio of one node, and at GRID_NODE_COUNT successive SIGMA_Z."""
+            """Return -ln p, summed over axes, at GRID_NODE_COUNT successive nodes of ln SIGMA_Z.
+
+            All nodes have the same ratio SIGMA_A / SIGMA_Z, with the grid index ``ratio_index``.
+            """
             sigmas_z_m = np.exp(LN_SIGMA_NODE_SPACING * (first_sigma_z_index + GRID_NODES))
             return np.asarray(
                 sum(
@@ -381,15 +385,15 @@ def maximise_likelihood(
     measurement_weights : ndarray, shape (m,)
         Initial weight of each measurement.
     fits_outliers : bool
-        True to estimate the outliers; False to keep the weights.
+        True to estimate the outliers and reduce their weights; False to keep the initial weights.
     """
     if len(measurement_weights) <= 2 * INITIAL_FIT_MEASUREMENT_COUNT:
         return _fit_noises_and_outliers(
             positions_by_axis, start_parameters, measurement_weights, fits_outliers
         )
     # In a long flight, a fit to the first measurements gives the initial values. The positions may
-    # begin with KF's initial state, which has no weight. Both arrays therefore omit the same number
-    # of rows at the end
+    # have one more row at the start, KF's initial state. Therefore cut the same number of rows from
+    # the end of both arrays
     omitted_count = len(measurement_weights) - INITIAL_FIT_MEASUREMENT_COUNT
     first_fit = _fit_noises_and_outliers(
         [
@@ -451,11 +455,11 @@ def _fit_noises_and_outliers(
                 outlier_probability, normalised_squares, measured_axis_counts
             )
         has_outliers = outlier_probability.sum() >= 1.0 or outlier_probability.max() >= 0.5
-        # Without outliers until now, keep the fit to all measurements
+        # If no outliers are found now or before, keep the noise fit to all measurements
         if not has_outliers and not previous_probability.any():
             outlier_probability = previous_probability
             break
-        # 3. Noises, with a small weight for outliers
+        # Fit the noise parameters again; outliers have a small weight
         measurement_weights = outliers.compute_weights(outlier_probability)
         likelihood = NegativeLogLikelihood(
             positions_by_axis, measurement_weights, start_parameters.sigma_z_m
@@ -509,8 +513,8 @@ def _estimate_normalised_squares(
     """
     squared_errors_and_axis_counts = []
     for positions in positions_by_axis:
-        # First estimate the constant errors (such as biases), to subtract their effect. There is
-        # only one time offset
+        # First estimate the constant errors (such as biases), to subtract their effect. positions
+        # has only one time offset: index 0
         constant_errors = fit_constant_errors(
             [positions], noise_parameters, measurement_weights
         ).estimate_constant_errors_by_segment()[:, 0]
@@ -587,7 +591,7 @@ def _maximise_by_gradient(
     measurement_count = len(likelihood.measurement_weights)
 
     def score_per_measurement(log_parameters: Array) -> float:
-        # Dividing by the number of measurements gives L-BFGS-B a suitable first step
+        """Return -ln p ÷ number of measurements, which gives L-BFGS-B a suitable first step."""
         try:
             return likelihood(to_noise_parameters(log_parameters)) / measurement_count
         # A large score makes L-BFGS-B try a shorter step
@@ -595,6 +599,7 @@ def _maximise_by_gradient(
             return UNCOMPUTABLE_SCORE
 
     def to_noise_parameters(log_parameters: Array) -> NoiseParameters:
+        """Convert the logarithms of the nonzero parameters; all others are 0."""
         return NoiseParameters(
             **dict(zip(nonzero_parameters, np.exp(log_parameters).tolist(), strict=True))
         )

@@ -103,6 +103,7 @@ def combine_heading_parts(
     drift_p_value: float,
     method: Literal["orientation", "positions"],
 ) -> HeadingError:
+    """Combine the heading errors of all parts of a flight: mean, σ, and drift."""
     heading_errors_deg = [heading_part.heading_error_deg for heading_part in parts]
     return HeadingError(
         misalignment_deg=float(np.mean(heading_errors_deg)),
@@ -211,6 +212,7 @@ def _average_flight_parts(
 
 
 def heading_rad(quaternions: pd.DataFrame) -> Array:
+    """Return the headings (rad, clockwise from above, without jumps by 2π) of an attitude table."""
     return heading(quaternions[Columns.QUATERNION].to_numpy())
 
 
@@ -304,8 +306,8 @@ def _estimate_heading_error_from_positions(
         misalignment_rad += float(correction_rad)
         if abs(correction_rad) < MAX_HEADING_CHANGE_AT_CONVERGENCE_RAD:
             break
-    # 2. Heading error of each part: its deviation from the mean, reduced if it is mostly noise
-    # (empirical Bayes). Variance due to drift: variance of the estimates minus their noise variance
+    # Deviation of each flight part from the mean heading error. Variance due to drift: variance of
+    # the deviations minus their noise variance
     deviation_rad = error_rad - correction_rad
     drift_variance_rad2 = 0.0
     if not has_constant_heading:
@@ -337,9 +339,9 @@ def _fit_heading_errors(
 ) -> tuple[NoiseParameters, Array, Array]:
     """Fit the noises; return them, and heading error (rad) and variance (rad²) of each segment."""
     positions_and_increments = motion.make_positions_at_offset(0.0)
-    # A small heading error adds the motion, rotated by 90°. The motion along the smooth path
-    # through the positions is used, because noise in the motion from the IMU would make the
-    # estimate too small. This path is the last input: a scale factor error adds the motion itself
+    # A scale factor error adds a multiple of the motion to the increments, and a small heading
+    # error a multiple of the motion rotated by 90°. The motion is that of a smooth path through the
+    # positions: noise in the IMU motion would make the estimates too small
     for increments in (
         positions_and_increments.delta_position_m,
         positions_and_increments.delta_velocity_m_s,
@@ -357,9 +359,9 @@ def _fit_heading_errors(
     )
     constant_errors = position_fit.estimate_constant_errors_by_segment()[:, 0]
     covariance = np.linalg.inv(position_fit.compute_constant_error_information())[:, 0]
-    # A heading error rotates true distances, but it was fitted with the measured distances of the
-    # smooth path. It is therefore divided by the ratio of true to measured distances. The last
-    # constant error, the scale factor error, is 1 minus this ratio
+    # The derivative with respect to the heading error contains measured distances instead of true
+    # ones. The heading error is therefore divided by true ÷ measured distance. This ratio is 1
+    # minus the scale factor error, which is the last constant error
     true_to_measured_scale = np.maximum(1.0 - constant_errors[:, -1], MIN_TRUE_TO_MEASURED_SCALE)
     return (
         noise_parameters,

@@ -259,8 +259,8 @@ def _fit_scale(design_matrix: DesignMatrix, is_skipped: BoolArray) -> Estimate:
     if curvature <= 0.0:
         return Estimate(0.0, math.inf)
     grid_step = tested_scales[1] - tested_scales[0]
-    # At the ends of the tested range, where the centre is the last but one value, do not
-    # extrapolate by more than half a grid step
+    # At the ends of the tested range, do not extrapolate by more than half a grid step. The centre
+    # is then one step from the end, so the limit is 1.5 steps
     best_scale = tested_scales[centre_index] + float(np.clip(vertex_shift, -1.5, 1.5)) * grid_step
     centre_fit = fit_scale(centre_index)
     # The linearised rotation by θ (x - θ y, y + θ x) lengthens the acceleration by √(1 + θ²)
@@ -293,9 +293,7 @@ def _find_jumps(
     ]
 
     def mask_outliers_near_jump(jump_time_s: float) -> BoolArray:
-        # Omit the positions just after a tested jump, because they may be a burst of outliers.
-        # Positions after a reset that the source reports are valid: use them, even if is_skipped
-        # contains them
+        """Return the mask of measurements to omit in the test for a jump at ``jump_time_s``."""
         if jump_time_s in source_reset_times_s:
             return is_skipped & ~_is_in_window(
                 time_s, jump_time_s, OUTLIER_RETEST_DURATION_AFTER_JUMP_S
@@ -307,8 +305,8 @@ def _find_jumps(
         outlier_run_starts_s = time_s[
             np.flatnonzero(is_skipped & ~np.append(False, is_skipped[:-1]))
         ]
-        # After a jump, all positions may seem to be outliers: test each start of a run of outliers.
-        # Of all measurement times, test only the most significant one
+        # After a jump, all positions may seem to be outliers. Candidates are therefore the starts
+        # of runs of outliers, and the most significant of all measurement times
         candidate_times_s = [
             *source_reset_times_s,
             *_find_significant_jump_times(design_matrix, fit, is_skipped, outlier_run_starts_s),
@@ -427,7 +425,7 @@ def _locate_jump(
     max_residual_square = chdtri(design_matrix.axis_count, MAX_FALSE_OUTLIER_PROBABILITY)
 
     def test_for_outliers(jump_time_s: float) -> BoolArray:
-        # Measurements near the jump may be outliers, so the fit omits them
+        """Return True for measurements that are outliers if the jump is at ``jump_time_s``."""
         fit, _ = design_matrix.fit_with_jump(jump_time_s, is_skipped | is_near_jump)
         return fit.compute_residual_squares() > max_residual_square
 
@@ -587,8 +585,9 @@ class DesignMatrix:
     ) -> Array:
         """Run KF on several inputs; return normalised innovations ν/√S, one column per input.
 
-        The inputs may be those of the last measurements only. ``gains`` has the rows S, position
-        gain and velocity gain.
+        ``dp`` (m), ``dv`` (m/s) and ``measured_m`` have one row for each measurement and one column
+        for each input. They may omit the first measurements. ``gains`` has the rows S (m²),
+        position gain and velocity gain, with one column for each measurement.
         """
         preintegrated_inputs = replace(
             self.preintegrated_inputs,
@@ -605,8 +604,9 @@ class DesignMatrix:
         """Fit the errors of IMU and positions to KF's innovations by least squares.
 
         The errors are accelerometer biases, yaw of the position frame, slow acceleration error and
-        jumps of the positions. ``scale`` is a trial scale factor of the positions; the acceleration
-        is multiplied by it. ``is_skipped`` is True for measurements that are not used.
+        jumps of the positions. ``scale`` is a trial scale factor of the positions. The acceleration
+        and SIGMA_A are multiplied by it, so that they match the positions. ``is_skipped`` is True
+        for measurements that are not used; their residuals are also returned.
         """
         gains = compute_gains(
             self.preintegrated_inputs, scale * self.sigma_a_m_s2, self.sigma_z_m, is_skipped
@@ -654,9 +654,8 @@ class DesignMatrix:
         """
         inputs, axis_count = self.preintegrated_inputs, self.axis_count
         axis_input_count = INPUTS_PER_AXIS * axis_count
-        # The scale factor multiplies only quantities that contain measured acceleration. For each
-        # axis, these are the flight data (first column of the axis) and the velocity error due to a
-        # yaw error
+        # The scale factor multiplies the inputs that are computed from measured acceleration. For
+        # each axis, these are the flight data (column 0 of the axis) and the effect of a yaw error
         input_scale_factors = np.ones(inputs.measurement_m.shape[1])
         factors_by_axis = input_scale_factors[:axis_input_count].reshape(axis_count, -1)  # a view
         factors_by_axis[:, [0, 1 + FRAME_ROTATION_COLUMN]] = scale
@@ -668,8 +667,8 @@ class DesignMatrix:
             np.hstack([inputs.measurement_m, unit_steps]),
             gains,
         )
-        # The columns of the responses are, in this order: flight data and constant errors of each
-        # axis, slow acceleration errors, and jumps
+        # Each column of the responses contains the innovations due to one input: flight data and
+        # constant errors of each axis, then slow acceleration errors, then jumps
         axis_responses, slow_error_responses, jump_responses = np.split(
             responses, [axis_input_count, len(input_scale_factors)], axis=1
         )

@@ -241,9 +241,9 @@ class PositionsAndImuMotion:
     ) -> Iterator[PositionsAndIncrements]:
         """Yield positions and IMU increments of a few flight segments at once.
 
-        The increments have one row for each time offset. With ``estimates_scale``, a fit to them
-        also estimates the scale factor of the positions, see
-        :func:`~px4fuse.filter.marginal_likelihood.subtract_smooth_path`.
+        The increments have one row for each time offset. With ``estimates_scale``, they contain the
+        derivative with respect to the scale factor error of the positions, so a fit estimates this
+        error. Otherwise a fit assumes the scale factor 1. Small batches limit the memory.
         """
         element_count = (
             len(time_offsets_s) * self.measurement_m.size * len(PRIOR_SIGMAS_OF_CONSTANT_ERRORS)
@@ -453,8 +453,8 @@ def make_segment_motion(
         )
         for names in (Columns.SPECIFIC_FORCE, Columns.ANGULAR_RATE)
     )
-    # The angular rate, without a large gyro bias, is integrated from the logged attitude. The first
-    # selected attitude sample is before the first step, for interpolation at this step
+    # The attitude starts at the logged attitude and follows the gyro, without a large gyro bias.
+    # The first selected attitude sample is before the first step, for interpolation at this step
     attitude_time_s = attitude.index.to_numpy()
     first_row, end_row = np.searchsorted(attitude_time_s, step_times_s[[0, -1]], side="right")
     attitude_samples = attitude.iloc[max(first_row - 1, 0) : end_row][Columns.QUATERNION]

@@ -184,7 +184,8 @@ def _run_with_floats(
             innovation_and_gains, updated_state = model.update_step(
                 position, velocity, covariance, measured_m, settings.sigma_z_m**2
             )
-            # UPDATE_TABLE_COLUMNS. Position and variances are those before the update (prior)
+            # The order is that of UPDATE_TABLE_COLUMNS. Position and variances are those before the
+            # update (prior)
             update = measured_m, *innovation_and_gains, position, covariance[0], covariance[2]
             position, velocity, covariance = updated_state
         yield (position, velocity, *covariance, *update)

@@ -87,6 +87,7 @@ def preintegrate(axis: Axis, settings: Settings) -> PreintegratedMotion:
     dp, dv = integrate_acceleration(prediction_steps, prediction_steps.acceleration_m_s2)
 
     def sum_by_interval(values: Array) -> Array:
+        """Sum each column over the prediction steps of each interval between measurements."""
         return np.stack(
             [np.bincount(prediction_steps.interval_index, column) for column in values.T], 1
         )
@@ -151,7 +152,9 @@ def compute_gains(
 ) -> Array:
     """Return the innovation variance S (m²), position gain and velocity gain of each measurement.
 
-    The result has the shape (3, m). They do not depend on the measured positions.
+    S and gains do not depend on the measured positions. The shape is (3, m). ``is_skipped`` is True
+    for measurements that KF does not fuse: their gains are 0, but S is computed. By default, KF
+    fuses all.
     """
     process_noise = (
         sigma_a_m_s2 * sigma_a_m_s2 * preintegrated_motion.process_noise_per_sigma_a_squared
@@ -234,6 +237,7 @@ def compute_profile_likelihood_interval(
     first_index, last_index = np.flatnonzero(score_rises <= max_log_likelihood_drop)[[0, -1]]
 
     def interpolate_interval_end(inside_index: int, outside_index: int) -> float | None:
+        """Interpolate between a grid value inside the interval and its neighbour outside."""
         if not 0 <= outside_index < len(grid):
             return None
         indices = [inside_index, outside_index]
@@ -267,17 +271,21 @@ def find_profile_likelihood_interval(
     max_sqrt_log_likelihood_drop = float(np.sqrt(MAX_LOG_LIKELIHOOD_DROP * variance_factor))
 
     def find_interval_end(direction: float, search_limit: float) -> float | None:
-        """Return the lower (direction -1) or upper (1) end, or None beyond the search limit."""
+        """Return the lower (direction -1) or upper (1) end of the interval of the first parameter.
+
+        None if the end is beyond ``search_limit``.
+        """
         other_log_sigma = best_log_sigmas[1]
 
         @cache  # brentq computes the ends of its bracket again
         def compute_drop_excess(change: float) -> float:
             """Return √(decrease of the log-likelihood) minus its limit, after a change of ln σ.
 
-            The interval ends where this is zero. It is nearly linear, so brentq needs few steps.
+            ``change`` is the distance from the best ln σ. The result is zero at the end of the
+            interval, and nearly linear, so brentq needs few steps.
             """
-            # At each change, the best value of the other parameter is searched (profile). The
-            # search starts at the result for the previous change
+            # Profile likelihood: for each change of ln σ of one parameter, search the best value of
+            # the other. The search starts at the result for the previous change
             nonlocal other_log_sigma
             if change == 0.0:  # the maximum-likelihood estimate
                 return -max_sqrt_log_likelihood_drop

@@ -141,8 +141,8 @@ class PositionsAndIncrements:
             measurement_and_prior_precision[
                 self.segment_start_indices[has_too_few_measurements]
             ] += 1.0
-            # 2. Degrees of freedom: number of measured states and of initial states with a strong
-            # prior, minus two for each segment, which determine its initial position and velocity
+            # Degrees of freedom: number of measured states and of initial states with a strong
+            # prior, minus two per segment (its initial position and velocity are fitted)
             is_known = (measurement_and_prior_precision > 0.0) & (
                 (measurement_and_prior_precision > self.prior_precision)
                 | (self.prior_precision > MIN_PRECISION_OF_KNOWN_STATE)
@@ -254,12 +254,13 @@ def fit_positions(
 ) -> PositionFit:
     """Fit constant errors (such as biases) to positions, with given SIGMA_A and variances.
 
-    The inputs of this regression are the data, then the derivative of the data with respect to each
-    constant error. Each input consists of positions and of IMU increments Δp and Δv. Constant
-    errors change only the increments, so the positions of the derivatives are zero.
+    The regression has 1 + c inputs: the data, then the derivative of the data with respect to each
+    of the c constant errors. An input consists of positions and of IMU increments Δp and Δv.
+    Constant errors change only the increments, so the positions of the derivatives are zero.
 
     ``measured_m``, shape (axes, 1 or time offsets, k, measurements), contains the positions of the
-    first k inputs. By default, k is 1: the measured positions.
+    first k inputs; the positions of the other inputs are zero. By default, k is 1, and
+    ``measured_m`` contains the measured positions.
     """
     if measured_m is None:
         measured_m = np.nan_to_num(positions.measurement_m.T)[:, None, None]
@@ -279,8 +280,8 @@ def fit_positions(
         for rows in (slice(axis, axis + 1) for axis in axes):
             measured_axis_m, increments = measured_m[rows], (dp[rows], dv[rows])
             weighted_increments = system.weight_increments(*increments)
-            # This array has state_count values for each measurement, so its segment edges are
-            # multiplied by state_count
+            # This array has state_count values per measurement. Below, the segment edges are
+            # therefore multiplied by state_count
             whitened_explained_part = system.whiten_explained_part(
                 measured_axis_m, *weighted_increments
             )
@@ -327,8 +328,9 @@ def subtract_smooth_path(
     """Subtract a smooth path through the positions from the positions and the IMU increments.
 
     The remaining numbers are small and have small rounding errors. With ``estimates_scale``, also
-    set the derivative of the data with respect to a scale factor error of the positions. Such an
-    error changes the data in proportion to the path, so the derivative is the path.
+    set the last column of the increments: the derivative with respect to a scale factor error of
+    the positions. Such an error is proportional to the path, so this column contains the increments
+    of the path.
     """
     measured_m = positions.measurement_m.copy()
     dp = positions.delta_position_m.copy()
@@ -347,12 +349,12 @@ def subtract_smooth_path(
         smoothed_state[:, :, positions.segment_start_indices] = 0.0
         path_m = smoothed_state[..., 0]
         path_velocity_m_s = smoothed_state[..., 1]
-        # The increments of the path are subtracted from those of the IMU, so they have the same
-        # definition: Δp does not include the motion with the velocity at the start of the interval
+        # The increments Δp of the path must have the same definition as those of the IMU: without
+        # the motion due to the velocity at the start of the interval
         path_delta_position_m = np.diff(path_m) - positions.interval_s * path_velocity_m_s[..., :-1]
         measured_m[:, axes] -= path_m[:, 0].T
-        # All tested time offsets have the same measured positions, so the same path is subtracted
-        # for all of them: that of the first time offset
+        # The measured positions are the same for all tested time offsets, so the path of the first
+        # time offset is subtracted for all of them
         for array, increment in ((dp, path_delta_position_m), (dv, np.diff(path_velocity_m_s))):
             array[axes, :, 0] -= increment[:, :1]
             if estimates_scale:
@@ -366,10 +368,11 @@ def estimate_squared_errors(
     variance_m2: Array,
     constant_errors: Array,
 ) -> ArrayPair:
-    """Return the expected squared error (m²) of each measurement, summed over its measured axes.
+    """Return the expected squared error (m²) and the number of measured axes of each measurement.
 
-    The expected value is the squared difference between measured and smoothed position, plus the
-    variance of the smoothed position. Return also the number of measured axes of each measurement.
+    Along one axis, the expected squared error is the squared difference between measured and
+    smoothed position, plus the variance of the smoothed position. It is summed over the axes that
+    have a measured position (not NaN).
 
     Parameters
     ----------
@@ -430,8 +433,8 @@ def compute_segment_inner_products(
     inner_products_by_batch = []
     for begin in range(0, right_factor_positions_m.shape[1], INNER_PRODUCTS_PER_BATCH):
         batch_slice = np.s_[:, begin : begin + INNER_PRODUCTS_PER_BATCH]
-        # fit_positions returns the inner products of all pairs of its inputs. The inputs are here
-        # the vectors u, the vectors v (with zero increments), and the derivatives with respect to
+        # Inputs of fit_positions, which returns the inner products of all pairs of inputs: the left
+        # factors u, the right factors v (with zero increments), and the derivatives with respect to
         # the constant errors (with zero positions)
         dp, dv = (
             np.concatenate(
@@ -451,8 +454,8 @@ def compute_segment_inner_products(
         left_and_right_factor_positions_m = np.concatenate(
             [left_factor_positions_m[batch_slice], right_factor_positions_m[batch_slice]], axis=1
         )[:, None]
-        # Of the inner products of all u with all v, only the diagonal is returned: the product of
-        # each u with the v of the same index
+        # Inner products of all pairs of inputs in each segment. Only the products of each left
+        # factor u with the right factor v of the same index are returned below (np.diagonal)
         gram_matrix = fit_positions(
             replace(positions, delta_position_m=dp, delta_velocity_m_s=dv),
             sigma_a_m_s2,
@@ -514,8 +517,8 @@ class BandedNormalEquations:
     def whiten_explained_part(self, measured_m: Array, *weighted_increments: Array) -> Array:
         """Return L⁻¹b for each input of the regression, with Ax = b and A = LLᵀ.
 
-        The shape is (..., values). The inner product of two results, b₁ᵀA⁻¹b₂, is the part of the
-        weighted inner product of the two inputs that position and velocity x explain.
+        The shape is (..., state_count · m). The inner product of two results, b₁ᵀA⁻¹b₂, is the part
+        of the weighted inner product of the two inputs that position and velocity x explain.
         """
         right_hand_side = self._make_right_hand_side(measured_m, *weighted_increments)
         # LAPACK solves a triangular system with unit diagonal 30 % faster. With L = UD, D the
@@ -556,9 +559,9 @@ class BandedNormalEquations:
         right_hand_side[..., 1:, 1] = weighted_dv
         right_hand_side[..., :-1, 0] -= weighted_dp
         right_hand_side[..., :-1, 1] -= self.interval_s * weighted_dp + weighted_dv
-        # The derivatives with respect to the constant errors contain no positions, so only the
-        # first inputs change here. A measurement is the sum of position and time-correlated noise
-        # (if it is fitted), so it adds to the rows of both states
+        # Only the first inputs of the regression contain positions; the derivatives with respect to
+        # constant errors do not. A measurement is the sum of position and time-correlated noise (if
+        # it is fitted), so its weighted value is added in the rows of both states
         weighted_measurements = self.precision[:, 0] * measured_m
         right_hand_side_with_measurements = right_hand_side[..., : measured_m.shape[-2], :, :]
         right_hand_side_with_measurements[..., 0] += weighted_measurements
@@ -581,9 +584,9 @@ class BandedNormalEquations:
         (a, c), b = self.cholesky_factor[0].reshape(-1, 2).T, self.cholesky_factor[1, ::2]
         d, f = time_reversed_cholesky_factor[0].reshape(-1, 2)[::-1].T
         e = time_reversed_cholesky_factor[1, ::2][::-1]
-        # The information of both blocks L, which is LLᵀ, is added. Both contain the block of A for
-        # this measurement, so it is subtracted once. The variance of the position is element 00 of
-        # the inverse
+        # A block L of a Cholesky factor contains the information LLᵀ. Add LLᵀ of both factors, and
+        # subtract the diagonal block of A once, because both contain it. The position variance is
+        # element 00 of the inverse of the result [[p00, p01], [p01, p11]]
         p00 = a**2 + e**2 + f**2 - self.bands[0, 0::2]
         p01 = a * b + d * e - self.bands[1, 0::2]
         p11 = b**2 + c**2 + d**2 - self.bands[0, 1::2]
@@ -644,9 +647,9 @@ def factorise(
     # FᵀQ⁻¹ in the row of velocity and the column of position
     inverse_q00, inverse_q01, inverse_q11 = inverse_q
     position_velocity_weight = inverse_q00 * interval_s + inverse_q01
-    # A = diag(precision) + Σ [-F I]ᵀ Q⁻¹ [-F I] over the intervals. An interval adds the 2 × 2
-    # block FᵀQ⁻¹F to the states at its start, Q⁻¹ to those at its end, and -Q⁻¹F below the first
-    # block, with Q⁻¹ = [[a, b], [b, c]]:
+    # A = diag(precision) + Σ [-F I]ᵀ Q⁻¹ [-F I] over the intervals, with the transition matrix F.
+    # Each interval adds three 2 × 2 blocks to A: FᵀQ⁻¹F for the states at its start, Q⁻¹ for the
+    # states at its end, and -Q⁻¹F below the first block. With Q⁻¹ = [[a, b], [b, c]]:
     #   FᵀQ⁻¹F = [[a, a dt + b], [a dt + b, (a dt + 2 b) dt + c]]
     #   Q⁻¹F = [[a, a dt + b], [b, b dt + c]]
     # LAPACK's band format: each state has its element on the diagonal, then the elements below it.
@@ -664,7 +667,8 @@ def factorise(
     position_bands[:-1, 0] += inverse_q00
     position_bands[:-1, 1] += position_velocity_weight
     velocity_bands[:-1, 0] += (position_velocity_weight + inverse_q01) * interval_s + inverse_q11
-    # Set the block between both, below the diagonal, to -Q⁻¹F
+    # Set the block that connects the states at start and end of an interval, below the diagonal, to
+    # -Q⁻¹F
     position_bands[:-1, state_count] = -inverse_q00
     position_bands[:-1, state_count + 1] = -inverse_q01
     velocity_bands[:-1, state_count - 1] = -position_velocity_weight
@@ -676,7 +680,7 @@ def factorise(
         # Gauss-Markov process: variance σ_c² at the start of a segment, driving noise (1 - ρ²) σ_c²
         correlated_noise_step_variance_m2 = correlated_sigma_m**2 * np.append(1.0, 1.0 - rho**2)
         # A measurement is the sum of position and correlated noise. Its precision is therefore
-        # added to the diagonal elements of both states, and is their off-diagonal element
+        # added to A three times: diagonal element of each state, and element that connects them
         correlated_noise_bands = band_storage[:, 2]
         position_bands[:, 2] = position_measurement_precision
         correlated_noise_bands[:, 0] = (

@@ -80,6 +80,7 @@ class Settings:
     clock_offset_s: float = 0.0
 
     def __post_init__(self) -> None:
+        """Reject a value that is out of range or not a number, and an unknown input of KF."""
         for name, valid_range in SETTING_RANGES.items():
             value = getattr(self, name)
             if not valid_range.low <= value <= valid_range.high:  # NaN is out of range, too
@@ -102,8 +103,8 @@ class Settings:
 def requested_settings(request: ComparisonRequest) -> Settings:
     """Return the KF settings that the user requested; all others have default values."""
     values = {name: getattr(request, name) for name in Settings.__dataclass_fields__}
-    # With auto, the time offset is estimated later. For a position file, read_flight adds it to the
-    # timestamps
+    # With auto, the time offset is estimated later. For a position file, read_flight adds the given
+    # time offset to the timestamps, so KF must not add it again
     if request.clock_offset_s == AUTO or request.position is not None:
         del values["clock_offset_s"]
     return Settings(**{name: value for name, value in values.items() if value is not None})

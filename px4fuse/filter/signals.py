@@ -214,6 +214,9 @@ def make_axes(
 ) -> tuple[Axis, ...]:
     """Project positions and acceleration of a flight onto north, east, down and aisle.
 
+    The aisle is the main horizontal direction of the flight. The positions of the down axis are
+    from the barometer, if the track has one.
+
     Parameters
     ----------
     names : tuple of str, optional
@@ -296,6 +299,7 @@ def make_downsampling_slice(time_s: Array) -> slice:
 def report_too_few_measurements(
     analysis_name: str, measurement_count: int, min_count: int
 ) -> Unavailable:
+    """Return the reason why an analysis has no result: it has too few measurements."""
     return Unavailable(
         analysis_name,
         f"only {measurement_count} measurements (at least {min_count} are needed)",
@@ -315,6 +319,7 @@ def weighted_sum(samples: pd.DataFrame, columns: list[str], weights: Array) -> A
 def _choose_axis_direction(
     name: str, track: PositionTrack, segment: Segment, heading_deg: float | None
 ) -> tuple[Array, float | None, str]:
+    """Return direction (unit vector in NED), heading (°; None for down) and note of an axis."""
     if name != AISLE_AXIS:
         axis_index = AXIS_NAMES.index(name)
         return np.eye(3)[axis_index], (None if name == "down" else 90.0 * axis_index), ""
@@ -344,7 +349,7 @@ def integrate_ned_acceleration(
     gap_rows = np.flatnonzero(is_gap)
     # KF needs the time without IMU data in each step: the increase of the cumulative gap time from
     # start to end of the step. This time is linear between gap edges, so only its values at the
-    # edges are stored. In gaps, the second moments give the variance of the unknown acceleration
+    # edges (and at the first and last sample) are stored
     cumulative_gap_s = np.cumsum(np.where(is_gap, np.diff(time_s), 0.0))
     gap_edge_rows = np.unique([0, *gap_rows, *(gap_rows + 1), len(time_s) - 1])
     return Acceleration(

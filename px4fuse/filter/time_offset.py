@@ -51,7 +51,7 @@ FINE_GRID_OFFSET_COUNT = 11
 MAX_INTERPOLATED_OFFSET_STEP_S = 0.05
 # Number of time offsets for which the report shows the likelihood of the positions
 LIKELIHOOD_CURVE_POINT_COUNT = 121
-# Prior σ (rad) of EKF2's heading with GNSS: a wrong GNSS delay (0.2 s) causes an error of 5°
+# Prior σ (rad; 11°) of EKF2's heading with GNSS. A wrong GNSS delay of 0.2 s alone causes 5° error
 GNSS_HEADING_SIGMA_RAD = 0.2
 # Tested differences (s): time offset of one part of the flight minus that of the whole flight
 FLIGHT_PART_OFFSET_DIFFERENCES_S = np.concatenate(
@@ -72,8 +72,8 @@ MIN_OFFSET_SIGMAS = 3.0
 # Minimum significant time offset (s): position error of 3 cm at 1 m/s
 MIN_TIME_OFFSET_S = 0.03
 # The effect of IMU noise on the time offset is simulated for groups of successive flight segments.
-# Minimum number of simulated groups (a short flight is simulated several times), and segments in
-# each group
+# Minimum number of simulations (number of groups · noise series of each group), and number of
+# segments in a group
 IMU_NOISE_SIMULATION_COUNT, SEGMENTS_PER_NOISE_SIMULATION = 96, 12
 
 
@@ -309,8 +309,8 @@ def _compute_offset_likelihood_curve(
     """
     while True:
         offsets_s = _make_offset_grid(offset_s, half_width_s, LIKELIHOOD_CURVE_POINT_COUNT)
-        # -ln p is interpolated between tested time offsets. New offsets are tested if the curve
-        # extends beyond the tested ones, or if their spacing is too large for an interpolation
+        # Interpolate the negative log-likelihood (-ln p) between tested time offsets. Test new
+        # offsets outside the tested range, or if the spacing is too large for an interpolation
         if (
             offsets_s[0] < tested_offsets_s[0]
             or offsets_s[-1] > tested_offsets_s[-1]
@@ -328,6 +328,7 @@ def _compute_offset_likelihood_curve(
 
 
 def _make_offset_grid(centre_s: float, half_width_s: float, offset_count: int) -> Array:
+    """Return equally spaced time offsets (s) around a centre, inside the search range."""
     return np.linspace(
         max(centre_s - half_width_s, -MAX_TESTED_TIME_OFFSET_S),
         min(centre_s + half_width_s, MAX_TESTED_TIME_OFFSET_S),
@@ -347,9 +348,9 @@ def _simulate_variance_increase_by_imu_noise(
     in the velocity, so its effect is not negligible.
 
     Method: the score (derivative of the log-likelihood with respect to the time offset) is the
-    inner product of position residuals and velocity. With simulated noise, the inner product of
-    residuals and velocity noise is the error of the score. Its variance is computed for groups of
-    flight segments and added over the groups.
+    inner product of position residuals and velocity. The error of the score is the inner product of
+    residuals and velocity noise; both are simulated. The variance of this error is computed for
+    each group of successive flight segments, then summed over the groups.
     """
     # Draw noise: noise_series_count independent series for each axis and measurement or interval
     positions_at_offset = imu_motion.make_positions_at_offset(offset_s)
@@ -363,6 +364,7 @@ def _simulate_variance_increase_by_imu_noise(
     noise_series_count = -(-IMU_NOISE_SIMULATION_COUNT // len(first_segment_of_each_group))
 
     def draw_normal(count: int) -> Array:
+        """Return standard normal noise, shape (axes, noise series, count)."""
         return rng.standard_normal((count, axis_count, noise_series_count)).transpose(1, 2, 0)
 
     q00, q01, q11 = (

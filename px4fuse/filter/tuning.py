@@ -334,7 +334,7 @@ def _fit_with_imu_motion(
     start_parameters = replace(
         kf_fit.noise_parameters, random_walk_m=START_RANDOM_WALK_M if may_drift else 0.0
     )
-    # An approximate time offset is sufficient: it hardly changes the noises
+    # An approximate time offset is sufficient: it hardly changes the estimated noise
     offset_s, start_parameters = imu_motion.search_time_offset(
         start_parameters, START_SIGMA_A_FACTORS, estimates_scale=False
     )
@@ -347,6 +347,7 @@ def _estimate_noises(fit: NoiseFit) -> tuple[NoiseEstimate, NoiseEstimate]:
     log_sigma_a, log_sigma_z = np.log([best_parameters.sigma_a_m_s2, best_parameters.sigma_z_m])
 
     def score(tested_log_sigma_a: float, tested_log_sigma_z: float) -> float:
+        """Return -ln p at tested ln SIGMA_A and ln SIGMA_Z."""
         sigma_a, sigma_z = np.exp([tested_log_sigma_a, tested_log_sigma_z]).tolist()
         return fit.score(NoiseParameters(sigma_a, sigma_z, best_parameters.random_walk_m))
 
@@ -381,6 +382,7 @@ def _make_noise_estimate(
     search_range: tuple[float, float],
     variance_factor: float = 1.0,
 ) -> NoiseEstimate:
+    """Return the estimate of a noise parameter with its 95 % interval."""
     estimate = float(np.exp(best_log_sigmas[0]))
     interval_low, interval_high = find_profile_likelihood_interval(
         score, best_log_sigmas, search_range, variance_factor
@@ -399,6 +401,7 @@ def _assess_kf_consistency(
     noise_parameters: NoiseParameters,
     is_outlier: BoolArray,
 ) -> Consistency | Unavailable:
+    """Test the consistency of KF with given noises along one axis, without outliers."""
     nu, s = innovations(
         preintegrated_motion, noise_parameters.sigma_a_m_s2, noise_parameters.sigma_z_m, is_outlier
     )
@@ -408,6 +411,7 @@ def _assess_kf_consistency(
 def _test_noises_on_second_half(
     name: str, current_parameters: NoiseParameters, fit: NoiseFit
 ) -> HeldOutCheck | Unavailable:
+    """Estimate SIGMA_A and SIGMA_Z from the first half of a flight, and test them on the second."""
     first_half_count = len(fit.measurement_weights) // 2
     if first_half_count < MIN_MEASUREMENTS:
         return Unavailable(

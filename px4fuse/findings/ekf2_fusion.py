@@ -85,6 +85,7 @@ DEFAULT_ACTION = "Check mounting and power supply of the sensor."
 
 
 def detect(analysis: Analysis) -> Findings:
+    """Yield the findings on the fusion of the positions and of EKF2's other aiding sources."""
     yield from detect_position_fusion_faults(analysis)
     if isinstance(analysis.aids, Unavailable):
         return
@@ -141,8 +142,7 @@ def detect_unfused_positions(analysis: PreparedComparison) -> Findings:
                 evidence,
             )
         return
-    # In the other cases, find the condition of EKF2 that was not met in the longest time without
-    # fusion
+    # Otherwise find the EKF2 condition that was not met in the longest time without fusion
     spans = find_spans_with_value(0.0, fusion_flag, analysis.segment)
     longest_span_s = max(spans, key=lambda span: span[1] - span[0])
     parameters = {**analysis.flight.log.parameters, **ekf2.parameters}
@@ -187,6 +187,7 @@ def _find_received_source(analysis: PreparedComparison) -> PositionTrack | None:
 
 
 def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
+    """Detect that EKF2 declares its own horizontal position invalid (flag ``xy_valid`` is 0)."""
     is_valid = ekf2.status_flags.get("xy_valid")
     if is_valid is None or is_valid.empty:
         return
@@ -327,9 +328,8 @@ def detect_aid_faults(
         yield _make_not_fused_finding(
             fusion_parameter, aids_of_sensor, kf_position_aid, height_error_m
         )
-    # Test first if the mean innovation changes in flight: such a change also affects the mean
-    # innovation and the mean NIS of the whole flight. If KF uses the positions of an aiding source,
-    # other findings report that EKF2 is overconfident
+    # A change of the mean innovation in flight also affects mean and NIS of the whole flight, so it
+    # is tested first. Other findings report overconfidence about the source of KF's positions
     for name, aid in aids_to_test.items():
         sensor_cause = _find_shared_sensor_cause(AIDS[name].switch, kf_position_aid)
         if not sensor_cause and any(result.change for result in aid.axes.values()):
@@ -346,6 +346,7 @@ def _make_not_fused_finding(
     kf_position_aid: str,
     height_error_m: float | None,
 ) -> Finding:
+    """Make the finding on a sensor of which EKF2 fused no sample for a long time."""
     aid_with_longest_gap = max(aids_of_sensor, key=lambda aid: aid.longest_gap_duration_s)
     aid_labels_text = ", ".join(map(_format_aid_label, aids_of_sensor))
     has_innovation_shift = any(axis.change for aid in aids_of_sensor for axis in aid.axes.values())
@@ -372,6 +373,7 @@ def _make_not_fused_finding(
 
 
 def _make_innovation_change_finding(name: str, aid: AidResult) -> Finding:
+    """Make the finding on the axis whose mean innovation changes most in flight."""
     changes = [(result.change, axis) for axis, result in aid.axes.items() if result.change]
     (time_s, mean_change), axis = max(changes, key=lambda item: abs(item[0][1]))
     innovation_sigma = aid.axes[axis].s_sqrt_median
@@ -387,6 +389,7 @@ def _make_innovation_change_finding(name: str, aid: AidResult) -> Finding:
 
 
 def _make_overconfident_finding(name: str, aid: AidResult, sensor_cause: str) -> Finding:
+    """Make the finding that EKF2 is overconfident about an aiding source (mean NIS above 1)."""
     # Innovations alone do not distinguish noise from a wrong delay, so no noise value is proposed
     noise_text, action = "", "let the sensor's driver report the true noise (σ)"
     if AIDS[name].noise:
@@ -411,6 +414,7 @@ def _make_overconfident_finding(name: str, aid: AidResult, sensor_cause: str) ->
 
 
 def _make_innovation_bias_finding(name: str, aid: AidResult) -> Finding:
+    """Make the note on the axis with the largest mean innovation, in multiples of √S."""
     axis, worst_axis = max(
         aid.axes.items(), key=lambda item: abs(item[1].mean_normalised_innovation)
     )
@@ -430,6 +434,7 @@ def _make_innovation_bias_finding(name: str, aid: AidResult) -> Finding:
 
 
 def _find_large_height_error_m(analysis: Analysis, span_s: Span) -> float | None:
+    """Return EKF2's largest height error (m) in a time span without barometer fusion."""
     if "down" not in analysis.axes:
         return None
     errors = compute_position_errors(analysis.axes["down"], "ekf2")

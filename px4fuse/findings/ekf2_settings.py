@@ -135,6 +135,7 @@ def find_confirmed_noise_rerun(analysis: Analysis) -> Rerun | None:
 
 
 def detect_rejections(analysis: Analysis) -> Findings:
+    """Detect positions that EKF2 rejects, and a gate so small that it causes the rejections."""
     ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2):
         return
@@ -159,6 +160,7 @@ def detect_rejections(analysis: Analysis) -> Findings:
 
 
 def _find_rejections(analysis: Analysis, gate: float) -> Findings:
+    """Detect that EKF2 rejects at least 1 % of the positions, or of the heights."""
     down_comparison = analysis.axes.get("down")
     # EKF2 rejects north and east together, so one horizontal axis is sufficient
     results = [analysis.main]
@@ -188,6 +190,7 @@ def _find_rejections(analysis: Analysis, gate: float) -> Findings:
 
 
 def _find_rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
+    """Return the action against rejections along an axis."""
     aid = find_aid(analysis, result.axis.name)
     helpful_reruns = [
         rerun for rerun in analysis.select_main_reruns() if _prevents_rejections(rerun)
@@ -201,6 +204,7 @@ def _find_rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
 
 
 def _prevents_rejections(rerun: Rerun) -> bool:
+    """Return True if a re-run with one change improves EKF2 and more than halves rejections."""
     before, after = rerun.before.rejected_fraction, rerun.after.rejected_fraction
     return (
         before is not None
@@ -269,7 +273,7 @@ def detect_parameter_changes(analysis: Analysis) -> Findings:
 
 
 def _differ_by_min_factor(value_before: float, value_after: float) -> bool:
-    """Return True if both values are known and differ by more than the minimum factor."""
+    """Return True if both values are known, and differ by more than the minimum factor."""
     low, high = sorted((value_before, value_after))
     return low > 0.0 and high > MIN_SIGMA_RATIO_OR_RMSE_CHANGE_FACTOR * low
 

@@ -64,7 +64,8 @@ MIN_GYRO_BIAS_RAD_S = 0.05
 # If EKF2's accelerometer bias is at its limit, and the specific force measured at rest differs from
 # gravity by more than this value (m/s²), the message states the specific force
 MIN_GRAVITY_ERROR_M_S2 = 0.3
-# Maximum fraction of the flight in which EKF2's tilt or heading is not aligned, without a finding
+# EKF2's tilt or heading is reported as not aligned only if this fraction of the flight and the next
+# limit are both exceeded
 MAX_UNALIGNED_ATTITUDE_FRACTION = 0.02
 # Maximum time (s) from EKF2's tilt alignment to its heading alignment, without a finding
 MAX_HEADING_ALIGNMENT_DELAY_S = 5.0
@@ -77,6 +78,7 @@ MAX_FUSION_START_TO_RESET_S = 1.0
 
 
 def detect(analysis: Analysis) -> Findings:
+    """Yield the findings on EKF2's state: resets, instance switches, IMU biases, alignment."""
     ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2):
         return
@@ -116,9 +118,10 @@ def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
 def _detect_bias_at_limit(
     analysis: Analysis, ekf2: Ekf2, bias_states: pd.DataFrame, median_imu_at_rest: pd.Series | None
 ) -> Findings:
+    """Detect an IMU bias estimate that is at EKF2's limit for at least half of the flight."""
     for parameter, unit, sensor, columns in BIAS_LIMIT_PARAMETERS:
         limit = ekf2.parameters.get(parameter, 0.0)
-        # Fraction of the time at the limit, of the axis with the largest fraction
+        # Fraction of the time with the bias at its limit, for each axis; then the largest of them
         fractions = (bias_states[columns].abs() >= MIN_BIAS_TO_LIMIT_RATIO * limit).mean()
         axis_index = int(np.argmax(fractions))
         time_at_limit_fraction = float(fractions.iloc[axis_index])
@@ -309,6 +312,7 @@ def detect_instance_switches(ekf2: Ekf2, segment: Segment) -> Findings:
 
 
 def _is_take_off_height_reset(analysis: Analysis, reset: Reset) -> bool:
+    """Return True for a reset of the height only, shortly after take-off."""
     return not any(reset.delta[:2]) and any(
         start_s <= reset.time_s <= start_s + TAKE_OFF_DURATION_S
         for start_s, _ in find_airborne_spans(analysis.flight)

@@ -179,6 +179,7 @@ def make_hidden_error_finding(
 
 
 def _find_source_remedy(analysis: Analysis) -> str:
+    """Return the advice to check time offset and slow errors of the position source."""
     remedy = "Check the time offset of the positions (px4fuse sync LOG)."
     if isinstance(analysis.time_offset, Unavailable):
         remedy = (
@@ -199,7 +200,7 @@ def _make_drift_finding(
     ``filter_labels`` are the filters whose position error exceeds their reported σ.
     """
     loop, drift_text, rmse_sentence = find_usable_loop(analysis), rmse_text, ""
-    # State the closure error first if it shows the drift: true end known, path from odometry
+    # State the loop closure error first if the true end is known and the path is odometry
     if (
         loop is not None
         and not (loop.is_landing_place_assumed or loop.is_absolute_track)
@@ -255,6 +256,7 @@ def _compute_alignment_rmse(
 
 
 def make_possible_drift_finding(analysis: Analysis) -> Finding:
+    """Make the note that the source may drift, with noise and closure error, if known."""
     loop, horizontal_tuning = find_usable_loop(analysis), analysis.tuning.get(HORIZONTAL)
     evidence: dict[str, float | str] = {"source": analysis.source.name}
     message = (

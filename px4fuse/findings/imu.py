@@ -55,6 +55,7 @@ MIN_MEASURED_TO_REQUIRED_RATE_RATIO = 0.98
 
 
 def detect(analysis: Analysis) -> Findings:
+    """Yield the findings on IMU data, attitude rate and excessive tilt."""
     yield from detect_impossible_acceleration(analysis)
     yield from detect_tumbling(analysis)
     yield from detect_accelerometer_bias(analysis)
@@ -110,7 +111,7 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
                 f" EKF2's bias estimate is {forward:+.2f} m/s² forward and {right:+.2f} m/s² right."
             )
         sensor_text = "accelerometers and the level horizon"
-    # Case 2: EKF2's estimate. It has no effect on EKF2, which corrects the bias
+    # Case 2: bias estimated by EKF2. EKF2 corrects this bias, so the bias is no severe fault
     elif ekf2_bias_m_s2 is not None:
         can_be_severe = False
         forward, right, down = ekf2_bias_m_s2
@@ -190,6 +191,7 @@ def detect_clipping(analysis: Analysis) -> Findings:
 
 
 def detect_imu_gaps(analysis: Analysis) -> Findings:
+    """Detect a gap in the input of KF: missing IMU or attitude samples."""
     gap_s, imu, log = analysis.main.kf_run.input_gap_s, analysis.flight.imu, analysis.flight.log
     if isinstance(imu, Unavailable):
         return

@@ -81,6 +81,7 @@ def detect_inconsistent_closures(loop: Loop) -> Findings:
 
 
 def _make_false_closure_finding(closure: LoopClosure, is_landing_place_assumed: bool) -> Finding:
+    """Make the finding on a loop closure that the χ² test rejects."""
     is_landing = closure.source == LANDING_CLOSURE_SOURCE
     closure_text = str(closure)
     if is_landing and is_landing_place_assumed:

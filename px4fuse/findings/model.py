@@ -68,8 +68,8 @@ RESET_TIME_KEY = "reset_at_s"
 # A finding with one of these ids is the cause of other findings only if its severity is warning or
 # error, not note
 CAUSES_ONLY_ABOVE_SEVERITY_NOTE = ("ekf2_not_aligned", "parameter_changed")
-# A finding that another finding causes normally gets the action of that other finding. Findings
-# with these ids keep their own action, because it also corrects the cause
+# Findings that keep their own action even if another finding is their cause, because their action
+# also corrects the cause
 EFFECTS_WITH_OWN_ACTION = ("ekf2_ev_delay_wrong",)
 
 _KF_FINDINGS = ("kf_underconfident", "kf_overconfident")
@@ -192,13 +192,13 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         if (
             cause_group is None
             or (cause_group[0].severity == "note" and cause in CAUSES_ONLY_ABOVE_SEVERITY_NOTE)
-            # The white position noise exceeds the measurement noise that a filter assumes. It may
-            # also cause the findings that the time-correlated noise would explain
+            # White position noise above the assumed measurement noise may also cause the effects
+            # of time-correlated noise, so time-correlated noise is not stated as their cause
             or WHITE_TO_ASSUMED_NOISE_RATIO_KEY in cause_group[0].evidence
         ):
             continue
-        # A line contains the id of an effect. A line "id: kind of cause" applies only to findings
-        # with this kind of cause in their evidence
+        # Each line of effects_text is the id of a finding that ``cause`` can cause. A line
+        # "id: word" applies only if the evidence of the finding has this word as "cause"
         effect_lines, severity = effects_text.splitlines(), cause_group[0].severity
         for group in groups.copy():
             effect, *effects_of_effect = group

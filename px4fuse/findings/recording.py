@@ -165,7 +165,7 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
                 kf_summary.remedy,
                 {"count": len(result.kf_run.updates)},
             )
-            return  # one finding for all axes
+            return  # report only one axis
 
 
 def detect_source_not_logged(analysis: PreparedComparison) -> Findings:

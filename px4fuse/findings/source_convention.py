@@ -80,8 +80,8 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
         item for item in findings if FINDING_CATALOGUE[item.id].report_class == "unusable"
     ]
     if unusable_positions:
-        # Axes, unit and clock that were estimated from unusable positions are not valid. Exception:
-        # a wrong lever arm does not change the orientation, so its finding remains
+        # Findings on axes, unit and clock are not valid if the positions are unusable. With a wrong
+        # lever arm as only fault, the finding on the orientation remains valid
         is_only_lever_arm = {item.id for item in unusable_positions} == {"source_lever_arm"}
         causes = [
             item for item in causes if is_only_lever_arm and item.id == "source_orientation_wrong"
@@ -124,8 +124,8 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
     first_cause, *other_causes = causes
     return [
         first_cause,
-        # The wrong convention may cause the findings on EKF2, so list them as its effects. Omit
-        # those with another known cause, because this cause may not exist with the right convention
+        # The wrong convention may cause the findings on EKF2, so they become its effects. Findings
+        # with another known cause are omitted: with the right convention, that cause may not exist
         *(
             replace(item, message=f"{item.title}.", caused_by=first_cause.id)
             for item in effects
@@ -139,6 +139,7 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
 def _detect_position_faults(
     convention: Convention, faults: ConventionFaults, source: PositionTrack
 ) -> Findings:
+    """Yield the findings on wrong axes, rotation, unit or timestamps of the positions."""
     positions_text = source.positions_text
     is_position_file = source.alignment is not None
     log_odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
@@ -199,6 +200,7 @@ def _detect_position_faults(
 def _detect_wrong_axes_or_rotation(
     convention: Convention, faults: ConventionFaults, source: PositionTrack, evidence_sentence: str
 ) -> Findings:
+    """Yield the finding on wrong axes, or on axes that are only rotated about the vertical."""
     is_position_file, rotation_deg = source.alignment is not None, faults.rotation_deg
     stated_frame = source.alignment.frame.upper() if source.alignment else "NED"
     axes = find_axes_in_file(convention.axes, stated_frame)
@@ -261,6 +263,7 @@ def _detect_wrong_axes_or_rotation(
 def _detect_orientation_faults(
     convention: Convention, faults: ConventionFaults, source: PositionTrack
 ) -> Findings:
+    """Yield the finding on the orientation of the source, if it is wrong."""
     orientation = convention.orientation
     if orientation is None or not faults.orientation:
         return

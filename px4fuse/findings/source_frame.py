@@ -87,8 +87,8 @@ def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Find
         if not _truth_contradicts_heading_drift(analysis.flight, heading_error):
             yield _make_heading_drift_finding(analysis, heading_error)
         return
-    # An accelerometer bias has a similar effect as a rotation of the positions. The bias explains
-    # the effect if the rotation is not significant in a common estimate of both
+    # An accelerometer bias resembles a rotation of the positions. If the joint estimate of bias and
+    # rotation gives no significant rotation, the bias explains the deviation
     is_explained_by_bias = (
         not isinstance(systematic_errors, Unavailable)
         and source.orientation is None
@@ -106,7 +106,7 @@ def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Find
     if source.origin.is_gnss:
         reason = "GNSS positions refer to true north, so EKF2's heading is wrong by this rotation."
         _, action = _explain_gnss_heading_error(analysis)
-        advice = ""  # the action above is complete
+        advice = ""  # the action already contains the advice on the magnetometer
     elif source.name == ALIGNED_VISION_TOPIC:
         reason = "The positions that EKF2 rotated into its own frame do not fit the IMU."
         action = "Align the positioning frame with north."
@@ -144,6 +144,7 @@ def _explain_gnss_heading_error(analysis: Analysis) -> tuple[str, str]:
 
 
 def _truth_contradicts_heading_drift(flight: Flight, heading_error: HeadingError) -> bool:
+    """Return True if EKF2's heading drifts much less against ground truth than estimated."""
     truth, attitude = flight.truth, flight.attitude
     if (
         isinstance(truth, Unavailable)
@@ -165,6 +166,7 @@ def _truth_contradicts_heading_drift(flight: Flight, heading_error: HeadingError
 
 
 def _make_heading_drift_finding(analysis: Analysis, heading_error: HeadingError) -> Finding:
+    """Make the finding that EKF2's heading drifts relative to the positions."""
     source = analysis.source
     first_part, last_part = heading_error.find_extreme_parts()
     error_texts = (

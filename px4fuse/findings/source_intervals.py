@@ -53,8 +53,7 @@ MIN_FRACTION_OF_RARER_INTERVAL_LENGTH = 0.1
 # the period, to report downsampling. The deviation is 0.03 for intervals with jitter, and 0.29 for
 # random intervals
 MAX_RMS_ROUNDING_ERROR_IN_PERIODS = 0.06
-# px4fuse searches the period of a downsampled source among the median interval ÷ n, n = 1, 2, … to
-# this value
+# Maximum n: tested periods of a downsampled source are median interval ÷ n, with n = 1, 2, …
 MAX_SOURCE_PERIODS_PER_MEDIAN_INTERVAL = 4
 # Minimum duration (s) of a gap at the start or end of the flight: take-off and landing are detected
 # some seconds late
@@ -72,7 +71,7 @@ def detect(analysis: Analysis) -> Findings:
 def detect_source_gaps(analysis: Analysis) -> Findings:
     """Detect gaps in the position source."""
     source, whole_flight = analysis.source, analysis.segment.whole_flight
-    # 1. Divide the gaps into those of the log, at start or end of the flight, and in flight
+    # Divide the gaps: missing only in the log, at start or end of the flight, or in flight
     gaps, gaps_only_in_log = list[Span](), list[Span]()
     invalid_times_s = source.invalid_reasons.index
     for start_s, end_s in analysis.events.gaps:
@@ -87,7 +86,6 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
             gaps.append((start_s, end_s))
         elif end_s - start_s > MIN_GAP_AT_START_OR_END_S:
             yield _make_source_stops_or_begins_finding(analysis, (start_s, end_s), aids)
-    # 2. One finding for all gaps of the log, and one for all gaps in flight, on the longest of them
     if gaps_only_in_log:
         span_s, duration_text, evidence = _summarise_gaps(gaps_only_in_log)
         yield make_warning(
@@ -110,7 +108,7 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
 
 
 def _summarise_gaps(spans: list[Span]) -> tuple[Span, str, dict[str, float]]:
-    """Return the longest gap, a text with its duration, and evidence of a finding."""
+    """Return the longest gap (start, end), a text with its duration, and evidence for a finding."""
     start_s, end_s = max(spans, key=lambda span: span[1] - span[0])
     duration_text = f"{end_s - start_s:.1f} s"
     if len(spans) > 1:
@@ -120,6 +118,7 @@ def _summarise_gaps(spans: list[Span]) -> tuple[Span, str, dict[str, float]]:
 
 
 def _find_action_for_unlogged_positions(analysis: Analysis, start_s: float, end_s: float) -> str:
+    """Return the action for positions (from ``start_s`` to ``end_s``) that the log lacks."""
     for track in analysis.flight.positions:
         if track.origin.aid == analysis.source.origin.aid and len(track.samples[start_s:end_s]) > 2:
             return f"Run again with --position-source {track.name}, which contains these positions."
@@ -131,6 +130,7 @@ def _find_action_for_unlogged_positions(analysis: Analysis, start_s: float, end_
 def _make_source_stops_or_begins_finding(
     analysis: Analysis, span_s: Span, fused_aids: list[Aid]
 ) -> Finding:
+    """Make the finding on a gap at the start or end of the flight: positions begin late or stop."""
     (start_s, end_s), source = span_s, analysis.source
     duration_s, effect_sentence, action = end_s - start_s, "", ""
     if end_s == analysis.segment.whole_flight.end_s:
@@ -255,6 +255,7 @@ def _find_fused_aids(ekf2: Ekf2 | Unavailable, span_s: Span) -> list[Aid]:
 
 
 def detect_lost_samples(analysis: Analysis) -> Findings:
+    """Detect gaps of single positions in a recording with the sender's timestamps."""
     source, clock_map = analysis.source, analysis.source.clock_map
     if (
         clock_map is None

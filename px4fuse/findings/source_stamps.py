@@ -33,11 +33,11 @@ from .model import (
 MAX_RECEIPT_JITTER_S = 0.010
 # Maximum time (s) from the arrival timestamp of a position to its publication by PX4
 MAX_ARRIVAL_TO_PUBLICATION_DELAY_S = 0.001
-# Minimum latency (s) of positions, from measurement to arrival, for a finding if TIMESYNC converges
-# in flight; it causes a position error of 2 cm at 1 m/s
+# Minimum reported latency (s, from measurement to arrival) if TIMESYNC converges in flight. At
+# 1 m/s, 0.02 s is an error of 2 cm
 MIN_LATENCY_S = 0.02
-# Minimum latency (s) for severity "error" if TIMESYNC converges in flight, and minimum increase (s)
-# of the latency in flight for a finding; it causes a position error of 10 cm at 1 m/s
+# Minimum latency (s) for severity "error", and minimum reported increase (s) of the latency in
+# flight. At 1 m/s, 0.1 s is an error of 10 cm
 MIN_LATENCY_FOR_SEVERITY_ERROR_S = 0.10
 # Minimum rank correlation of latency with time, for a latency that grows in flight
 MIN_CORRELATION_OF_LATENCY_WITH_TIME = 0.8
@@ -46,9 +46,8 @@ MIN_DROPPED_POSITION_FRACTION = 0.02
 # Minimum number of positions before and after the convergence of TIMESYNC, to detect the
 # convergence
 MIN_POSITIONS_BEFORE_AND_AFTER_TIMESYNC = 10
-# Timestamps are arrival times before TIMESYNC converges, and measurement times afterwards. Minimum
-# fraction of timestamps of the expected kind in each part of the flight, or of arrival times in the
-# whole flight, for a finding
+# Minimum fraction of arrival times before TIMESYNC converges, and of measurement times afterwards,
+# to detect the convergence. Without convergence: minimum fraction of arrival times in the flight
 MIN_FRACTION_OF_EXPECTED_TIMESTAMP_KIND = 0.95
 # Minimum mean number of positions in a burst (positions that arrive together)
 MIN_BURST_POSITIONS = 2.5
@@ -64,6 +63,7 @@ ANSWER_TIMESYNC_ACTION = (
 
 
 def detect(analysis: Analysis) -> Findings:
+    """Yield the finding on position timestamps, depending on the clock of the source."""
     clock_map, positions_text = analysis.source.clock_map, analysis.source.positions_text
     if clock_map is None:
         yield from detect_arrival_timestamps(analysis)
@@ -117,6 +117,7 @@ def detect_bursts(analysis: Analysis) -> Findings:
 def detect_repeated_timestamps(
     analysis: Analysis, sample_count: int, distinct_count: int
 ) -> Findings:
+    """Report a coarse clock: several of ``sample_count`` samples have the same timestamp."""
     resolution_s = float(np.median(np.diff(analysis.source.samples.index)))
     rate_hz = sample_count / (distinct_count * resolution_s)
     yield make_error(
@@ -155,6 +156,7 @@ def detect_wrong_timestamp_unit_or_clock(analysis: Analysis, clock_name: str) ->
 def detect_constant_timestamps(
     positions_text: str, clock_map: ClockConversion, distinct_count: int
 ) -> Findings:
+    """Report timestamps that hardly change, and the jitter of the receive times used instead."""
     yield make_error(
         "source_timestamps_constant",
         f"The timestamps of {clock_map.pairs} {positions_text} have only {distinct_count} "

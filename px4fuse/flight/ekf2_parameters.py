@@ -172,7 +172,7 @@ def fill_parameters_with_defaults(
         for name, parameter in MODEL_PARAMETERS.items()
         if name not in excluded_parameter_names
     }
-    # These are parameters of external vision only
+    # Before PX4 v1.14, the default delay of external vision was different
     if uses_aid_mask(logged_values) and aid == EV_POS:
         defaults |= DEFAULTS_BEFORE_V1_14
     return {name: float(logged_values.get(name, default)) for name, default in defaults.items()}

@@ -143,6 +143,8 @@ def page(
 
     Parameters
     ----------
+    columns, rows
+        Contents of the table. The sections of a row without contents are omitted.
     sigma_ratio_axis : mapping, optional
         Axis of the columns with σ ratios: range, shaded bands and marks.
     title, subtitle, html_above_table : str
@@ -157,8 +159,8 @@ def page(
     full_table_note : str
         Sentence about the file with all rows.
 
-    The last eight are fields of the template ``frame.html``, which raises an error if one is
-    missing.
+    All parameters from ``title`` on are fields of the template ``frame.html``, which raises an
+    error if one is missing.
     """
     css_text = "".join(map(read_asset, ("colours.css", "base.css", "frame.css")))
     script = "".join(map(read_asset, ("dom.js", "frame.js")))

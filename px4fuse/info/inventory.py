@@ -207,7 +207,10 @@ def to_json_dict(inventory: Inventory) -> dict[str, Any]:
 def _list_logged_data(
     flight: Flight, comparison: PreparedComparison | None, reason: str
 ) -> Iterator[LoggedData]:
+    """Yield one entry for each type of data in a log, and for each position source."""
+
     def describe_stream(name: str, data: pd.DataFrame | Spans | Unavailable) -> LoggedData:
+        """Return the entry of a type of data, by its key in STREAM_LABELS."""
         return _make_logged_data(STREAM_LABELS[name], data, flight.streams.get(name))
 
     ekf2, truth = flight.ekf2, flight.truth
@@ -284,6 +287,7 @@ def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> GapStatistics:
 def _list_analyses(
     flight: Flight, comparison: PreparedComparison | None, reason: str
 ) -> Iterator[AnalysisOption]:
+    """Yield each analysis, with the data that it uses or the reason why it is not possible."""
     if comparison is None:
         yield AnalysisOption("compare", False, reason)
     else:

@@ -248,6 +248,7 @@ def _require_in_range(name: str, value: float, min_value: float) -> None:
 
 
 def _require_valid_closure(closure: GivenClosure, path: Trajectory) -> None:
+    """Raise TrajectoryError if times or σ of a loop closure are not possible for a path."""
     start_s, end_s = path.time_s[[0, -1]]
     closure_text = f"{path.name}: loop closure {closure.time_1_s:.12g},{closure.time_2_s:.12g}"
     if not start_s <= closure.time_1_s < closure.time_2_s <= end_s:
@@ -264,6 +265,7 @@ def _require_valid_closure(closure: GivenClosure, path: Trajectory) -> None:
 def _compute_heading_error(
     true_end: TrueFinalPose | Unavailable, heading_change_deg: float | None
 ) -> float | Unavailable:
+    """Return the heading error (°) at the end of the loop, from -180° to 180°."""
     quantity = "heading error at the end of the loop"
     if isinstance(true_end, Unavailable):
         return true_end

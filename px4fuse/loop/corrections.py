@@ -114,7 +114,8 @@ def compute_odometry_variances(
 def _compute_variance_increments(variance: Array | None, node_indices: IntArray) -> Array | None:
     """Return the increases of reported variances between nodes, shape (k - 1, 3).
 
-    Return None if the variances do not grow along the path.
+    ``variance`` has shape (n, 3), ``node_indices`` the shape (k,). A decrease counts as 0. Return
+    None if the variances are not reported, or do not grow along the path.
     """
     if variance is None:
         return None
@@ -275,6 +276,7 @@ def distribute_closure_error_by_distance(
 
 
 def _explain_gate_rejection(correction_name: str, closure: LoopClosure) -> Unavailable:
+    """Return the reason why a correction does not exist: the χ² test rejects the loop closure."""
     return Unavailable(
         correction_name,
         f"the χ² gate rejects {closure} (squared Mahalanobis distance {closure.d2:.1f}, "
@@ -420,7 +422,7 @@ def score_paths(
             for reference in references
         }
         if path is odometry:
-            # All corrected paths have the same times, so they use the offsets of the odometry
+            # Corrected paths have the timestamps of the odometry, so they use its time offsets
             for reference_name, score in scores.items():
                 if isinstance(score, Evaluation) and score.time_offset.offset_s is not None:
                     time_offsets_s[reference_name] = score.time_offset.offset_s
@@ -448,6 +450,7 @@ def score_paths(
 def _evaluate_path(
     path: Trajectory, reference: Trajectory, time_offset_s: float | None
 ) -> Evaluation | Unavailable:
+    """Return ATE and RPE of a path; Unavailable if the paths cannot be compared."""
     try:
         return evaluate(path, reference, time_offset_s=time_offset_s)
     except Px4FuseError as error:

@@ -113,7 +113,7 @@ class LoopClosure(Record, kw_only=True):
 
 
 class PathResult(Record, kw_only=True):
-    """Path (corrected or not), with ATE and RPE against each reference."""
+    """Path before or after correction by loop closures, with ATE and RPE per reference."""
 
     # Maximum and RMS distance (m) between corrected and uncorrected positions
     correction_max_m: NonNegativeFloat
@@ -183,13 +183,13 @@ class Loop(Record, kw_only=True):
         return self.find_paths()["uncorrected"]
 
     def find_paths(self) -> dict[CorrectionName, PathResult]:
-        """Return the uncorrected path and all corrected paths, by name."""
+        """Return the odometry path and all paths corrected by loop closures, by name."""
         return {
             name: path for name, path in self.corrections.items() if isinstance(path, PathResult)
         }
 
     def select_reported_paths(self) -> tuple[PathResult, ...]:
-        """Return the uncorrected and the corrected paths of the report, without duplicates."""
+        """Return the odometry path and the paths corrected by loop closures, without duplicates."""
         paths = self.find_paths()
         if isinstance(self.heading_error_deg, Unavailable):
             # If the heading error is unknown, the path "by_distance" is corrected in position only.

@@ -97,6 +97,7 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
 
 
 def _make_kf_trajectory(flight: Flight) -> Trajectory:
+    """Run KF with default settings, and return its positions with the attitude of EKF2."""
     request = ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M, axes=AXIS_NAMES)
     prepared_comparison = prepare_comparison_inputs(flight, request)
     kf_comparison = compare(prepared_comparison)
@@ -166,7 +167,7 @@ def _read_reported_variances(samples: pd.DataFrame, columns: list[str]) -> Array
 
 @dataclass(frozen=True)
 class LoopSource:
-    """Trajectory, with its flight if it is from a flight log."""
+    """Trajectory of a loop, and the flight if the trajectory is from a flight log."""
 
     trajectory: Trajectory
     flight: Flight | None

@@ -42,7 +42,8 @@ GLOSSARY_FOLDERS = (Path(__file__).parent, Path(__file__).parents[2] / "docs")
 
 # Terminal output of a command, and results of the command or None
 CommandOutput = tuple[str, Any]
-# Function that converts the arguments of a tool to a command line without ``px4fuse``
+# Function that converts the arguments of a tool to the words of a command line that follow the name
+# of the program
 ToolArgumentParser = Callable[[Mapping[str, Any]], list[str]]
 
 
@@ -72,6 +73,7 @@ class Server(MCPServer[Any]):
         timeout_s: float,
         max_memory_bytes: int,
     ) -> None:
+        """Register the tools and prompts, and the resources: glossary, JSON Schema and findings."""
         super().__init__(
             "px4fuse",
             version=metadata.version("px4fuse"),
@@ -127,6 +129,7 @@ class Server(MCPServer[Any]):
         )
 
     async def _run_analysis_command(self, command_words: list[str], context: Any) -> CommandOutput:
+        """Run a command in a worker process, and send its progress messages to the client."""
         receiver, sender = Pipe(duplex=False)
         job_results = poll_with_limits(
             partial(self._run_command, sender), [command_words], 1, *self._limits, max_wait_s=0.0

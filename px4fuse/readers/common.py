@@ -59,7 +59,7 @@ class MessageLayout:
     is_step_function: bool = False
 
 
-# TOML keys of MessageLayout for tables of columns
+# Fields of MessageLayout that are tables in the TOML files
 _FIELD_TABLES = ("columns", "optional_columns", "scale")
 
 
@@ -135,7 +135,7 @@ def find_spans(flags: pd.Series, duration_s: float) -> Spans:
     # Receive times may jump backward. The running maximum keeps the spans in order
     start_times_s = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0)).tolist()
     end_times_s = [*start_times_s[1:], duration_s]
-    # strict=False: without flags, there is an end but no start
+    # strict=False: if no flag was logged, there are no start times, but one end time
     spans = zip(start_times_s, end_times_s, changes, strict=False)
     return tuple((start, end) for start, end, is_set in spans if is_set and end > start)
 
@@ -202,14 +202,17 @@ def classify_invalid_positions(samples: pd.DataFrame, columns: list[str]) -> "pd
 
 
 def _find_frozen_positions(positions: Array, time_s: Array) -> BoolArray:
-    """Return True for each repetition in a long run of equal positions, without its first."""
+    """Return True for each repetition in a long run of equal positions; False for the first.
+
+    ``positions`` has one row per sample.
+    """
     is_repeated = np.append(False, np.all(np.diff(positions, axis=0) == 0.0, axis=1))
     times_in_run_s = pd.Series(time_s).groupby(np.cumsum(~is_repeated))
     run_length = times_in_run_s.transform("size")
     run_duration_s = times_in_run_s.transform("max") - times_in_run_s.transform("min")
-    # A source may repeat single positions at random, with probability p. A run of n repetitions
-    # then has the probability p^n. n is too large if a run in the whole track is improbable:
-    # count · p^n < MAX_FALSE_ALARM_PROBABILITY_OF_FROZEN_RUN
+    # A source may repeat positions at random, with probability p. A random run of n repetitions
+    # then has the probability p^n. A run is frozen only if a random run of its length is improbable
+    # in the whole track: count · p^n < MAX_FALSE_ALARM_PROBABILITY_OF_FROZEN_RUN
     repetition_probability = np.clip(np.mean(is_repeated[1:]), 1e-6, 1.0 - 1e-6)
     max_random_run_length = np.log(
         len(time_s) / MAX_FALSE_ALARM_PROBABILITY_OF_FROZEN_RUN

@@ -113,6 +113,7 @@ class _TaggedLines:
 def _make_line_error(
     name: str, line_number: int, reason: str, remedy: str = _LINE_REMEDY
 ) -> TrajectoryError:
+    """Return an error that names the file and the line."""
     return TrajectoryError(f"{name}, line {line_number}: {reason}", remedy)
 
 
@@ -147,7 +148,8 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
     else:
         ids = np.unique(edge_vertex_ids)
         poses = np.zeros((len(ids), pose_value_count))
-        poses[:, 6:] = 1.0  # the identity rotation has w = 1
+        poses[:, 6:] = 1.0  # 3D: the identity quaternion has w = 1; 2D: no such column
+    # Row of each edge's vertices in ids. An unknown id gives the row of another vertex
     vertex_indices = np.minimum(np.searchsorted(ids, edge_vertex_ids), len(ids) - 1)
     edges.raise_where(
         ids[vertex_indices] != edge_vertex_ids,
@@ -199,6 +201,7 @@ def format_g2o(graph: PoseGraph) -> str:
 
 
 def _group_lines_by_tag(text: str, name: str) -> dict[str, _TaggedLines]:
+    """Group the lines of a g2o file by tag, without comments, FIX and ignored lines."""
     lines_by_tag = {tag: _TaggedLines(name, []) for tag in _TAGS}
     fixed_ids: set[str] = set()
     for line_number, raw_line in enumerate(text.split("\n"), start=1):
@@ -228,6 +231,7 @@ def _group_lines_by_tag(text: str, name: str) -> dict[str, _TaggedLines]:
 
 
 def _normalise_quaternions(lines: _TaggedLines, poses: Array) -> Array:
+    """Return the poses with unit quaternions. 2D poses (3 columns) have no quaternion."""
     if poses.shape[1] == 3:
         return poses
     with np.errstate(over="ignore"):

@@ -120,6 +120,7 @@ def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Fli
 
 
 def _read_imu(recording: Recording) -> TableOrUnavailable:
+    """Read valid IMU samples; Unavailable if the recording has fewer than two."""
     # HIGHRES_IMU is preferred, because it has SI units and µs timestamps
     layout = HIGHRES_IMU_LAYOUT
     if len(recording.rows(layout.topic)) < 2:
@@ -142,6 +143,7 @@ def _read_imu(recording: Recording) -> TableOrUnavailable:
 
 
 def _read_attitude(recording: Recording) -> TableOrUnavailable:
+    """Read the attitude from the most frequent message; Unavailable with fewer than two samples."""
     layout = recording.find_most_frequent_layout(ATTITUDE_LAYOUTS)
     attitude = common.select_rows_with_attitude(recording.read(layout))[Columns.QUATERNION]
     if len(attitude) < 2:
@@ -154,6 +156,7 @@ def _read_attitude(recording: Recording) -> TableOrUnavailable:
 
 
 def _read_ekf2(recording: Recording, parameters: Mapping[str, float]) -> Ekf2 | Unavailable:
+    """Read the state and variances that the autopilot's estimator sent."""
     autopilot, remedies = recording.autopilot, recording.remedies
     layout = MESSAGE_LAYOUTS["ODOMETRY"]
     # ODOMETRY has variances, so it is preferred unless its rate is much lower
@@ -235,6 +238,7 @@ def _read_ekf2_variance(
 
 
 def _read_airborne_spans(recording: Recording) -> Spans | Unavailable:
+    """Return the time spans in which the vehicle was not on the ground, from EXTENDED_SYS_STATE."""
     landed_states = recording.table("EXTENDED_SYS_STATE")["landed_state"]
     is_known = landed_states > 0
     if not np.any(is_known):
@@ -272,6 +276,7 @@ def _describe_log(
     replaced_parameter_notes: tuple[str, ...],
     ends_in_flight: bool,
 ) -> LogInfo:
+    """Describe the recording: firmware, vehicle, duration, damage and dropped samples."""
     frames, autopilot = recording.frames, recording.autopilot
     notes, damage_notes = [*recording.notes], []
     if frames.unknown_frame_count:

@@ -227,13 +227,13 @@ def _remove_nested_frames(frames: Int64Array) -> Int64Array:
     kept_rows = []
     previous_end = 0
     for row, (frame_start, frame_end, _) in enumerate(frames.tolist()):
-        # The next frame begins at the end of the previous frame, or after its own receive time:
-        # frame | receive time | frame | receive time | frame
+        # A frame begins where the previous frame ends, or after the receive time (8 bytes) between
+        # them
         expected_frame_starts = previous_end, previous_end + RECEIVE_TIME_BYTES
         is_expected = frame_start in expected_frame_starts
-        # A frame with another start is kept only if bytes were skipped: then no frame begins at an
-        # expected start. Otherwise, the frame is inside the previous frame, or it is part of a
-        # receive time whose bytes look like a frame by chance
+        # A frame at another offset is valid only if no frame begins at an expected offset: damaged
+        # bytes or an unknown frame then precede it. Otherwise, it is inside the previous frame, or
+        # bytes of a receive time look like a frame
         is_after_skipped_bytes = frame_start >= previous_end and all_frame_starts.isdisjoint(
             expected_frame_starts
         )
@@ -298,8 +298,8 @@ def _count_bytes_outside_frames(
     gap_starts = np.append(0, end_offsets)
     gap_ends = np.append(start_offsets, len(content))
     is_gap = gap_starts < gap_ends
-    # The loop must end with the bytes after the last frame with a known message, even if there are
-    # none: then `offset` is the end of the last complete frame, and an incomplete frame may follow
+    # The bytes after the last known frame always count as a gap, even if there are no such bytes.
+    # The loop then ends with the offset at which an incomplete last frame would begin
     is_gap[-1] = True
     for gap_start, gap_end in zip(
         gap_starts[is_gap].tolist(), gap_ends[is_gap].tolist(), strict=True

@@ -113,7 +113,10 @@ def fit_clock_line(x: Array, y: Array) -> ClockLine:
         slope = 1.0
 
     def select_least_delayed(slope: float) -> tuple[Array, IntArray]:
-        """Return the delay (s, with unknown zero) of each reading, and a row of each interval."""
+        """Return the delay (s) of each reading, and the row of the least delay in each interval.
+
+        The delay is y minus the line through (x0, 0), so it contains an unknown constant.
+        """
         delay_s = y - slope * (x - x0)
         return delay_s, pd.Series(delay_s).groupby(interval_of_row).idxmin().to_numpy()
 
@@ -365,8 +368,9 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
         longest_part = max(rows_by_part, key=len)
         longest_part_fraction = len(longest_part) / len(rows)
         rows, boot_times_s = rows[longest_part], boot_times_s[longest_part]
-        # `rows` are the frames that contain a boot time. If the longest part is the first (last)
-        # one, it also contains all frames before the first (after the last) boot time
+        # `rows` are the frames with a boot time in the longest part. Frames before the first boot
+        # time of the recording belong to its first part. Frames after the last boot time belong to
+        # its last part
         analysed_frame_slice = slice(
             0 if longest_part is rows_by_part[0] else int(rows[0]),
             len(frames) if longest_part is rows_by_part[-1] else int(rows[-1]) + 1,
@@ -382,8 +386,8 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
         find_longest_increasing_subsequence(np.rint(boot_times_s * 1e6).astype(np.int64)),
     )
     rows, boot_times_s = rows[increasing_time_rows], boot_times_s[increasing_time_rows]
-    # Without receive times in the file, the conversion from receive time to boot time changes
-    # nothing. Without any time, all receive times are zero
+    # A file without receive times gets boot times as receive times, so the conversion changes
+    # nothing. A file without boot times and receive times gets zeros
     receive_times_s = np.zeros(len(frames))
     receive_to_boot_time_fit = ClockLine(0.0, 0.0, 1.0, 0.0, len(rows))
     if frames.receive_times_us is not None:
@@ -415,11 +419,11 @@ def read_recording(frames: MavlinkFrames, address: MavlinkAddress, autopilot: st
 
 
 def _find_restarts(boot_times_s: Array) -> IntArray:
-    """Return the index of the first boot time after each restart of the autopilot.
+    """Return the index of the first boot time (time since boot) after each autopilot restart.
 
-    A single late or early packet also causes a backward step of the boot time. At a restart, all
-    following boot times are smaller. The boot times RESTART_CHECK_MESSAGE_COUNT messages before and
-    after the step are therefore compared, too.
+    A backward step alone may be a single late or early packet. Therefore, the boot time
+    RESTART_CHECK_MESSAGE_COUNT messages after the step must also be smaller than two times before
+    the step: the last one, and the one RESTART_CHECK_MESSAGE_COUNT messages earlier.
     """
     rows = np.flatnonzero(np.diff(boot_times_s) < -MIN_BACKWARD_STEP_AT_RESTART_S) + 1
     earlier_rows = np.maximum(rows - 1 - RESTART_CHECK_MESSAGE_COUNT, 0)

@@ -44,8 +44,8 @@ MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S = 1e5
 # Timestamps are boot times of the autopilot if their median difference (s) from the receive times
 # (boot clock) is at most this limit
 MAX_BOOT_TIME_DIFFERENCE_S = 10.0
-# Timestamps are not boot times if a conversion by TIMESYNC reduces their median difference (s) from
-# the receive times by at least this value
+# Timestamps are not boot times if a conversion by TIMESYNC reduces their median difference from the
+# receive times by at least this value (s)
 MIN_CLOCK_DIFFERENCE_REDUCTION_BY_TIMESYNC_S = 0.1
 MIN_TIMESYNC_REPLIES = 3
 # Maximum interval (s) between positions; a longer interval is a gap
@@ -64,6 +64,7 @@ class SenderClockConversion:
 
 
 def _read_vehicle_types(frames: MavlinkFrames) -> dict[MavlinkAddress, tuple[int, int]]:
+    """Return MAV_TYPE and MAV_AUTOPILOT in the first HEARTBEAT of each sender."""
     # In reverse order, so that the first message of a sender overwrites its later messages
     rows = frames.rows("HEARTBEAT")[::-1]
     types = frames.table("HEARTBEAT", rows)[["type", "autopilot"]].tolist()
@@ -178,7 +179,7 @@ def _map_sender_clock(
     median_time_s = np.median(position_times_s)
 
     def is_sender_time(time_s: Array) -> BoolArray:
-        """Return True for times of the clock that the position timestamps have."""
+        """Return True for times in the clock of the position timestamps."""
         return np.abs(time_s - median_time_s) < MAX_TIMESYNC_TO_POSITION_TIME_DIFFERENCE_S
 
     # TIMESYNC messages of the sender: its requests, and its replies to the autopilot
@@ -259,10 +260,11 @@ def map_clock_to_boot(
         return _describe_stopped_clock(name, time_source, timestamps_s, receive_times_s)
 
     def compute_difference_from_receipt_s(line: ClockLine) -> float:
+        """Return |median difference| (s) of converted timestamps from the times of receipt."""
         return abs(float(np.median(boot_time_at_receipt_s - line.at(timestamps_s))))
 
     def agrees_with_receipt(line: ClockLine) -> bool:
-        """Return False for timestamps of another clock than that of the conversion."""
+        """Return True if the converted timestamps are near the times of receipt (boot clock)."""
         return compute_difference_from_receipt_s(line) <= MAX_BOOT_TIME_DIFFERENCE_S
 
     clock_kind = "UNIX time" if np.median(timestamps_s) > MIN_UNIX_TIME_S else "clock"
@@ -346,6 +348,7 @@ def _fit_timesync(
 def _make_clock_mapping(
     clock: str, method: str, line: ClockLine, timestamps_s: Array, note: str
 ) -> SenderClockConversion:
+    """Return a conversion with its description: offset (s), drift (ppm) and jitter (s)."""
     middle_timestamp_s = 0.5 * float(timestamps_s.min() + timestamps_s.max())
     offset_s = float(line.at(middle_timestamp_s)) - middle_timestamp_s
     drift_ppm = (line.slope - 1.0) * 1e6

@@ -273,9 +273,10 @@ def _find_increasing_rows(times_s: Array) -> IntArray:
 def _check_row_count(
     table: PositionTable, usable_count: int, row_count: int, notes: list[str]
 ) -> None:
-    """Raise LogError if the table has too few usable rows.
+    """Raise LogError if the table has too few usable rows. ``notes`` become part of the message.
 
-    If many rows of a table without header are not usable, its first column is not the time.
+    A table without header also needs a high fraction of usable rows (``row_count`` rows in total).
+    With a lower fraction, its first column is probably not the time.
     """
     min_count = MIN_USABLE_ROWS
     if table.format == HEADERLESS_TABLE_FORMAT:
@@ -315,7 +316,8 @@ def _read_numbers(
     """Convert the text of the needed columns to numbers, and dates (ISO 8601) to UNIX times.
 
     Return the numbers, the column meanings and True. For a column of dates, the returned meaning
-    has the unit s. The last value is False if the dates have no time zone.
+    has the unit s. The last value is False if the dates have no time zone. Text that is not a
+    number becomes NaN.
     """
     known_columns = [index for index, meaning in enumerate(column_meanings) if meaning.kind]
     texts = table.read_cells([*quaternion_columns, *known_columns])
@@ -371,6 +373,7 @@ def _select_body(
 
 
 def _find_column_indices(table: PositionTable, wanted_columns: tuple[str, ...]) -> list[int]:
+    """Return the index of each column that the user gave by name or number (from 1)."""
     names = [name.casefold() for name in table.column_names]
     # A number is a column name or, otherwise, a position in the header
     names += [str(index + 1) for index in range(len(names))]
@@ -442,8 +445,8 @@ def _detect_time_column(
     The time of measurement is preferred to the time of recording. If the time column contains whole
     seconds, the nanoseconds of another column are added to it in ``numeric_table``.
     """
-    # Prefer a column of which less than half is empty or 0, then the best kind of time, then
-    # another unit than ns: a column in ns may contain only the fraction of a second
+    # Prefer columns with less than half of their cells empty or 0, then the time of measurement
+    # (TIME_KINDS), then units other than ns: ns may contain only the fraction of a second
     time_columns = [index for index, column in enumerate(column_meanings) if column.kind == "time"]
     is_mostly_empty = numeric_table[time_columns].fillna(0.0).eq(0.0).mean() >= 0.5
     time_column, *other_time_columns = sorted(

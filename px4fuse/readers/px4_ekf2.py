@@ -167,8 +167,8 @@ def _select_variance(topics: Topics, horizon_state: TableOrUnavailable) -> Table
 def _find_state_vector(topics: Topics) -> tuple[str, int]:
     """Return the topic with EKF2's state vector, and its number of attitude variances.
 
-    The topic is "" if it is not logged. The number is 0 if no supported PX4 release logs arrays of
-    these lengths.
+    The topic is "" if it is not logged. The number is 0 if the lengths of the logged arrays
+    ``states`` and ``covariances`` match no supported PX4 release.
     """
     for topic in STATE_VECTOR_TOPICS:
         table = topics.first_table(topic)
@@ -300,6 +300,7 @@ def compute_samples_per_step(
 def _read_accelerometer_bias(
     topics: Topics, horizon_state: TableOrUnavailable
 ) -> TableOrUnavailable:
+    """Return EKF2's accelerometer bias (m/s²) over time, in the columns SPECIFIC_FORCE."""
     if len(bias := topics.primary_samples(TOPIC_LAYOUTS["estimator_sensor_bias"]).dropna()):
         return bias
     if isinstance(horizon_state, Unavailable) or horizon_state.empty:

@@ -263,6 +263,7 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
 def _read_aid_topic(
     topics: Topics, aid: Aid, enabled_flag: pd.Series[float] | None
 ) -> AidLog | None:
+    """Read the innovations of an aiding source from its topic; None if it is not logged."""
     field_by_quantity = {
         "innovation": "innovation",
         "variance": "innovation_variance",

@@ -68,7 +68,7 @@ class PositionTable:
     notes: tuple[str, ...] = ()
 
     def describe_format(self) -> str:
-        """Describe the file format, or separator and header of a table with a header."""
+        """Describe the file format; for a table with a header, separator and header line."""
         if self.format:
             return f"the file format is {self.format}"
         separator_name = SEPARATORS[self.separator]

@@ -64,7 +64,7 @@ def is_bag(path: Path) -> bool:
 
 
 def read_bag(path: Path, topic: str | None) -> tuple[PositionTable, str, int]:
-    """Read the poses in one topic of a ROS bag, and its SHA-256 and size (bytes).
+    """Read the poses in one topic of a ROS bag, and the SHA-256 and size (bytes) of the bag.
 
     Raises
     ------
@@ -88,8 +88,7 @@ def read_bag(path: Path, topic: str | None) -> tuple[PositionTable, str, int]:
     sha256 = hashlib.sha256()
     for file in files:
         with file.open("rb") as stream:
-            # hashlib.file_digest adds the file to the hash that this function returns: the same
-            # hash for all files of the bag
+            # All files are added to one hash object, so the result is the hash of all files
             hashlib.file_digest(stream, lambda: sha256)
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:

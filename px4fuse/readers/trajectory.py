@@ -53,7 +53,8 @@ _TRUTH_NAME_PATTERN = re.compile(
 )
 # Number of bytes at the start of a file in which comments are searched
 _COMMENT_SEARCH_BYTES = 4096
-# Coordinate frame of a trajectory if its file allows only one frame (edn: axes of a camera)
+# Coordinate frame of a trajectory, if format or column names of the file allow only one frame. The
+# axes "edn" are those of a camera
 _FRAME_BY_RECORDING_FRAMES: dict[tuple[str, ...], Frame] = {
     ("ned",): "NED",
     ("enu",): "ENU",
@@ -140,6 +141,7 @@ def format_tum(trajectory: Trajectory) -> str:
 
 
 def _read_rotation(recording: PositionRecording) -> Rotation | None:
+    """Return the orientation of each pose; None if the file contains only positions."""
     quaternions = recording.quaternions
     if quaternions is None:
         return None
@@ -177,6 +179,7 @@ def _detect_trajectory_kind(
 
 
 def _detect_frame(kind: TrajectoryKind, position_m: Array) -> tuple[Frame, str]:
+    """Return the coordinate frame of a trajectory, and the reason as a sentence."""
     if kind != "slam":
         return "unknown", ""
     centred_m = position_m - position_m.mean(axis=0)

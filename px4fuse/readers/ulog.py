@@ -107,6 +107,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
 def _describe_damage(
     topics: Topics, imu: TableOrUnavailable, ends_in_flight: bool
 ) -> tuple[str, ...]:
+    """Return sentences about damage: the file ends within a message, or has invalid bytes."""
     duration_s = topics.log.duration_s
     damage_sentences = []
     if topics.is_truncated:
@@ -171,6 +172,7 @@ def _read_imu(topics: Topics) -> pd.DataFrame:
 
 
 def _read_airborne_spans(topics: Topics) -> Spans | Unavailable:
+    """Return the time spans of flight, from PX4's land detector; Unavailable if not logged."""
     land_detected = topics.read(TOPIC_LAYOUTS["vehicle_land_detected"])
     if land_detected.empty:
         return Unavailable(

@@ -189,6 +189,8 @@ class _TolerantULogParser(ULog):  # type: ignore[misc]
 
     @_skip_if_short
     def _MessageAddLogged(self, data: bytes, header: Any, formats: Any) -> Any:  # noqa: N802
+
+        # Number of fields of a topic, including those of nested message types
         @cache
         def count_fields(name: str) -> int:
             fields: list[tuple[str, int, str]] = formats[name].fields
@@ -412,8 +414,8 @@ def read_topics(name: str, content: bytes) -> Topics:
         with contextlib.redirect_stdout(io.StringIO()):  # suppress the warnings that pyulog prints
             ulog = _TolerantULogParser(content_reader, message_name_filter_list=list_topics())
             tables = _read_tables(ulog)
-            # Without known topics, read all topics, because the duration of the log and the names
-            # of its topics are needed
+            # If the log contains no topic that px4fuse uses, read all topics: their times give the
+            # duration of the log, and their names are reported
             known_or_all_topic_tables = tables or _read_tables(
                 _TolerantULogParser(_ULogContent(content))
             )
@@ -529,7 +531,7 @@ def _read_tables(ulog: ULog) -> TopicTables:
 
 
 def _find_data_span_us(tables: TopicTables, name: str) -> tuple[int, int]:
-    """Return the first and last time (µs) of the IMU data.
+    """Return the first and last time (µs) of the IMU data; ``name`` is the file name for the error.
 
     If the log contains no IMU data, the topic with the most samples is used.
     """
@@ -556,6 +558,7 @@ def _read_printable_text(info: dict[str, Any], key: str, default: str) -> str:
 
 
 def _format_firmware(info: dict[str, Any]) -> str:
+    """Return name and version of the firmware, for example "PX4 v1.14.0-beta"."""
     release = info.get("ver_sw_release")
     if not isinstance(release, int):
         return "unknown"

@@ -94,6 +94,7 @@ def format_aid_verdict(aid: AidResult) -> str:
 
 
 def _draw_aid_panels(page: Page, flight: Flight, aids: Mapping[str, AidResult]) -> None:
+    """Draw ν/√S of each enabled aiding source over time, in one plot per source."""
     flight_span_s, enabled_aids = find_flight_span(flight), _select_enabled_aids(aids)
     if (
         not enabled_aids

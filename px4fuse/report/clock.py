@@ -146,6 +146,7 @@ def make_time_offset_advice(
 def _format_delay_advice(
     comparison: PreparedComparison, time_offset: SourceTimeOffset, logged_delay_ms: float
 ) -> str:
+    """Return advice on EKF2's delay parameter of the position source."""
     delay_parameter = find_aid(comparison).delay
     fitted_delay_ms = estimate_delay_if_not_as_logged_ms(comparison, time_offset, logged_delay_ms)
     if fitted_delay_ms is None:

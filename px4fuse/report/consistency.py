@@ -104,6 +104,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _write_causes(page: Page, analysis: Analysis) -> None:
+    """Write a table of the re-runs that may correct the mean NIS or mean NEES of a filter."""
     axis, rows = analysis.main.axis, []
     for filter_name, statistic in product(FILTER_NAMES, CONSISTENCY_STATISTICS):
         label, exponent = ("mean NIS", 1.0) if statistic == "nis" else ("√NEES", 0.5)
@@ -125,6 +126,7 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
 
 
 def _select_tested_innovations(result: AxisComparison) -> InnovationsByFilter:
+    """Return ν/√S along an axis by filter, for filters with enough innovations for the tests."""
     return {
         name: values
         for name, values in normalised_innovations(result).items()
@@ -137,6 +139,7 @@ def _thin_line_style(name: str) -> dict[str, Any]:
 
 
 def _draw_running_nis(axes: Axes, innovations: InnovationsByFilter) -> None:
+    """Draw the mean NIS of all innovations (ν/√S, by filter) up to each time."""
     for name, values in innovations.items():
         running_nis = (values**2).expanding(MIN_INNOVATIONS).mean().dropna()
         draw_curve(axes, running_nis, **TRACK_STYLES[name], label=name)
@@ -152,6 +155,7 @@ def _draw_running_nis(axes: Axes, innovations: InnovationsByFilter) -> None:
 
 
 def _draw_histogram(axes: Axes, innovations: InnovationsByFilter) -> None:
+    """Draw the distribution of ν/√S of each filter, and the standard normal distribution."""
     innovation_grid = np.linspace(-MAX_DRAWN_SIGMAS, MAX_DRAWN_SIGMAS, 81)
     normal_density = np.exp(-0.5 * innovation_grid**2) / np.sqrt(2.0 * np.pi)
     axes.fill_between(innovation_grid, normal_density, color="#dcdcdc", lw=0, label="normal")
@@ -163,6 +167,8 @@ def _draw_histogram(axes: Axes, innovations: InnovationsByFilter) -> None:
 
 
 def _draw_autocorrelation(axes: Axes, innovations: InnovationsByFilter) -> None:
+    """Plot the autocorrelation of the innovations, with the 95 % band of white noise."""
+    # Bars of KF and EKF2 are shifted (in lags) to be side by side. EKF2 may be missing
     for shift, (name, values) in zip(
         np.linspace(-0.18, 0.18, len(FILTER_NAMES)), innovations.items(), strict=False
     ):
@@ -180,6 +186,7 @@ def _draw_autocorrelation(axes: Axes, innovations: InnovationsByFilter) -> None:
 
 
 def _format_statistics(consistency: Consistency | Unavailable) -> list[str]:
+    """Return the last five cells of the row of a filter; empty cells if it was not tested."""
     if isinstance(consistency, Unavailable):
         return [""] * 5
     return [

@@ -31,6 +31,7 @@ REFERENCE_LINE_STYLE = style.line_style(TRUTH_COLOUR, 0.8, (0, (4, 2)))
 
 
 def draw_pages(evaluation: Evaluation, _: object) -> Iterator[Page]:
+    """Draw the page on trajectory errors: method, table of errors, maps, and APE over time."""
     page = Page(
         "Trajectory error",
         "APE: distance of one pose from the reference (its RMSE over all poses is "
@@ -75,6 +76,7 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
 
 
 def _draw_path(axes: Axes, evaluation: Evaluation, axis_indices: list[int]) -> None:
+    """Draw the aligned path coloured by APE (m), with the reference, start and largest error."""
     error_m, path_m = evaluation.position_error_m, evaluation.aligned_position_m[:, axis_indices]
     stride = max(1, len(error_m) // style.MAX_DRAWN_POINTS)
     dots = axes.scatter(
@@ -125,6 +127,7 @@ def _compute_time_origin_s(evaluation: Evaluation) -> float:
 
 
 def _write_evaluation(page: Page, evaluation: Evaluation) -> None:
+    """Write both trajectories, the method, warnings, the table of errors, and notes."""
     for label, track in (
         ("Estimate", evaluation.estimate_track),
         ("Against", evaluation.reference_track),
@@ -143,7 +146,7 @@ def _write_evaluation(page: Page, evaluation: Evaluation) -> None:
 
 
 def _write_notes(page: Page, evaluation: Evaluation) -> None:
-    """Write the reasons for missing errors, and the notes of the evaluation."""
+    """Write the reasons why parts of ATE or RPE cannot be computed, and the notes."""
     ate, rpe_translations = evaluation.ate, (error.translation_m for error in evaluation.rpe)
     missing_reasons = [
         f"No {quantity.what}: {quantity.reason}."
@@ -177,6 +180,7 @@ def _write_warnings(page: Page, evaluation: Evaluation) -> None:
 
 
 def _make_error_rows(evaluation: Evaluation) -> list[list[str]]:
+    """Return the table rows: ATE, then the RPE of each distance or time."""
     rows = []
     errors: list[AbsoluteTrajectoryError | RelativePoseError] = [evaluation.ate, *evaluation.rpe]
     for error in errors:
@@ -202,6 +206,7 @@ def format_error(error: AbsoluteTrajectoryError | RelativePoseError) -> str:
 
 
 def describe_unaligned_rmse(evaluation: Evaluation) -> str:
+    """State the RMSE before the alignment, and rotation, translation and scale of the alignment."""
     estimate_m, reference_m = evaluation.unaligned_position_m, evaluation.reference_position_m
     rmse_m = compute_rms_length_m(estimate_m - reference_m)
     alignment = evaluation.transform
@@ -220,6 +225,7 @@ def format_rmse(statistics: Statistics | Unavailable) -> str:
 
 
 def describe_method(evaluation: Evaluation) -> str:
+    """Describe alignment, matched poses and time offset of an evaluation as one line."""
     association, offset_s = evaluation.association, evaluation.time_offset.offset_s
     offset_text = f"; time offset {offset_s:+.3f} s" if offset_s else ""
     return (

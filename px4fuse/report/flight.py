@@ -85,6 +85,7 @@ def find_zoom_span(result: AxisComparison) -> Span:
 
 
 def _describe_sigma_at_updates(result: AxisComparison) -> str:
+    """Describe the lines and markers of the plot of σ."""
     sentences = [
         "The line is σ of KF, which grows in each prediction (SIGMA_A "
         f"{result.kf_run.settings.sigma_a_m_s2:g} m/s²).",

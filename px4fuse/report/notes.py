@@ -55,8 +55,8 @@ def write_markdown(page: Page, notes: str) -> None:
     table_rows = list[list[str]]()  # rows of the current table, with the text of each cell
     previous_type = ""  # type of the last token; "heading_open" precedes the text of a heading
     for token in parser.parse(notes):
-        # This token can end a list item without text. The marker of the item needs the indent
-        # inside the item, so compute the indent before the token changes the level
+        # Indent of the current list item. Compute it before this token changes the level: if the
+        # token ends an item without text, the marker of the item is written with this indent
         indent = INDENT * min(level, MAX_INDENTS)
         if marker and token.type not in ("paragraph_open", "inline"):
             page.write("", indent=indent, marker=marker)  # the item does not begin with a paragraph

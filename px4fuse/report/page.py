@@ -16,7 +16,7 @@ from .style import MUTED_COLOUR, TEXT_COLOUR, Artist, Axes
 
 PAGE_WIDTH = 178.0 * 72.0 / 25.4  # points
 COLUMN_GAP = 5.0 * 72.0 / 25.4  # points, between two columns
-LABEL_WIDTH = 52.0  # points, of the labels beside texts
+LABEL_WIDTH = 52.0  # points, width of the column with labels, such as "Action"
 AXES_LEFT_MARGIN = 38.0  # points, for tick labels and axis label
 AXES_RIGHT_MARGIN = 8.0  # points
 LEGEND_HEIGHT = 12.0  # points, of each line
@@ -75,6 +75,7 @@ class Page:
         label_width: float = LABEL_WIDTH,
         colour: str = TEXT_COLOUR,
     ) -> None:
+        """Add texts with a bold label to their left."""
         styled_texts = [styled_text(text) if isinstance(text, str) else text for text in texts]
         styled_label = styled_text(label, colour, bold=True)
         self.add("labelled", label=styled_label, texts=styled_texts, width=label_width)
@@ -123,6 +124,7 @@ class Page:
         return axes
 
     def add_legend(self, entries: Sequence[Artist]) -> PageBlock:
+        """Add a legend in as many columns as fit into the page width, and return its block."""
         from matplotlib.figure import Figure  # noqa: PLC0415 - as in :meth:`add_panel`
 
         labels = [str(entry.get_label()) for entry in entries]

@@ -67,6 +67,7 @@ class EventMarkers(NamedTuple):
 def _make_event_markers(
     analysis: Analysis, rejection_times_s: Sequence[float] | Array
 ) -> list[EventMarkers]:
+    """Return the events to mark in plots over time: bands for time spans, symbols for times."""
     events = analysis.events
     event_markers = (
         EventMarkers("on the ground", events.ground_spans_s, ON_GROUND_BAND_STYLE),
@@ -187,6 +188,7 @@ def draw_panels(
 
 
 def add_legend(page: Page, analysis: Analysis) -> PageBlock:
+    """Add the legend of all plots over time: tracks, σ bands, and the events of the flight."""
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
@@ -250,6 +252,7 @@ def draw_tracks(axes: Axes, result: AxisComparison, quantity: QuantityColumns) -
 
 
 def _describe_errors(result: AxisComparison, quantity: QuantityColumns) -> str:
+    """State RMSE of each filter against ground truth, and RMS difference KF - EKF2."""
     rmse_texts = [
         f"{name} {rmse:.3f} {quantity.unit}"
         for name, filter_summary in get_statistics_by_filter(result).items()
@@ -263,6 +266,7 @@ def _describe_errors(result: AxisComparison, quantity: QuantityColumns) -> str:
 
 
 def _find_innovation_limit_m(result: AxisComparison) -> float:
+    """Return the limit (m) of the innovation axis for all filters."""
     limits_m = []
     for innovations in _collect_innovation_tables(result).values():
         median_innovation_sigma_m = np.sqrt(innovations["innovation_variance_m2"].median())
@@ -318,6 +322,7 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
 
 
 def _describe_innovations(result: AxisComparison) -> str:
+    """State number, verdict, mean and standard deviation of the innovations of each filter."""
     sentences = []
     for name, consistency in result.filters.items():
         label = FILTER_NAMES[name]
@@ -336,6 +341,7 @@ def _describe_innovations(result: AxisComparison) -> str:
 
 
 def _format_fraction_outside_two_sigma(result: AxisComparison) -> str:
+    """Format the fraction of innovations outside ±2√S of each tested filter; "" without one."""
     fractions_text = ", ".join(
         f"{name} {consistency.fraction_outside_two_sigma:.1%}"
         for name, consistency in get_statistics_by_filter(result).items()
@@ -351,6 +357,7 @@ def _draw_sigma(axes: Axes, result: AxisComparison, quantity: QuantityColumns) -
 
 
 def _format_median_sigma(result: AxisComparison, quantity: QuantityColumns) -> str:
+    """Format the median of the reported σ of position or velocity for each filter."""
     sigma_texts = []
     for name, filter_summary in get_statistics_by_filter(result).items():
         median_sigma = getattr(filter_summary, quantity.median_sigma_field_name)

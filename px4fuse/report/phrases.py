@@ -35,6 +35,7 @@ SIGMA_ERROR_TEXTS = {"underconfident": "too large", "overconfident": "too small"
 
 
 def format_settings(settings: Settings) -> str:
+    """Format noises, DT, acceleration input and clock offset of KF as one line."""
     offset_text = (
         f", clock offset {settings.clock_offset_s:+g} s" if settings.clock_offset_s else ""
     )
@@ -130,8 +131,9 @@ def list_verdict_warnings(comparison: Comparison) -> list[str]:
 
 
 def format_clock_map(clock: ClockConversion) -> str:
-    # These timestamps are boot times, or unusable (arrival times, few distinct values): the note
-    # describes them, and they have no offset and no drift
+    """Describe the conversion of a clock to the boot clock: offset, drift and jitter."""
+    # These timestamps are boot times, or they cannot be converted (arrival times, few distinct
+    # values). The note describes them, because they have no offset and no drift
     if clock.method in ("boot clock", "arrival time") or clock.distinct_stamps is not None:
         return f"{clock.clock}: {clock.note}"
     return (
@@ -163,6 +165,7 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
 
 
 def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
+    """Write the findings (detected faults), each with its action and its consequences."""
     for finding, *effects in split_cause_groups(findings):
         title = f"{capitalise_first_letter(finding_title(finding.id))} [{finding.id}]"
         texts = [styled_text(title, bold=True), styled_text(finding.message)]

@@ -51,6 +51,7 @@ def draw_pages(analysis: Analysis | AidingSourceAnalysis, results: FlightResults
 
 
 def _describe_log(flight: Flight, source: PositionTrack | None) -> Iterator[tuple[str, str]]:
+    """Yield pairs (label, text) on firmware, positions, parameters and input files of a log."""
     log = flight.log
     yield "firmware", f"{log.firmware}, git {log.firmware_hash}"
     yield "time zero", f"{log.boot_time_s:.6f} s after boot (first sample)"
@@ -74,6 +75,7 @@ def _describe_log(flight: Flight, source: PositionTrack | None) -> Iterator[tupl
 
 
 def _write_missing_data(page: Page, unavailable_parts: Iterable[Unavailable]) -> None:
+    """Write the reason and the remedy for each missing part of the data."""
     missing_data_texts = [
         (part.source or part.what, f"{part.reason}. {replace_argument_names(part.remedy)}")
         for part in unavailable_parts
@@ -100,6 +102,7 @@ def draw_loop_provenance(loop: Loop, results: LoopResults) -> Iterator[Page]:
 
 
 def _write_versions(page: Page, results: FlightResults | LoopResults) -> None:
+    """Write the command, and the versions of px4fuse, Python and libraries."""
     provenance = results.provenance
     libraries = (f"{name} {version}" for name, version in provenance.libraries.items())
     text_by_label = {

@@ -33,7 +33,11 @@ _COMMAND_PATTERN = re.compile(r"px4fuse (\w+) LOG(?![\w.])((?: --[a-z-]+ [-\w]+(
 def print_blocks(
     console: Console, blocks: Iterable[PageBlock], request: Request | None = None
 ) -> None:
-    """Print the texts, tables and diagnosis card of a page on the terminal."""
+    """Print the blocks of a page on the terminal: texts, tables, commands and the diagnosis.
+
+    Commands in labelled texts are completed with the options of ``request``, if it is given. Tables
+    are printed as texts on a narrow terminal.
+    """
     for block in blocks:
         match block["kind"]:
             case "text" | "heading":
@@ -57,6 +61,7 @@ def print_blocks(
 
 
 def _show_card(console: Console, paragraphs: Sequence[Paragraph]) -> None:
+    """Print the paragraphs of a diagnosis card, in ASCII if the terminal has no Unicode."""
     is_ascii_terminal = console.encoding.lower() not in UNICODE_ENCODINGS
     # In a pipe, each sentence is one line
     width = min(console.width, CARD_WIDTH) if console.is_terminal else console.width
@@ -69,6 +74,7 @@ def _show_card(console: Console, paragraphs: Sequence[Paragraph]) -> None:
 
 
 def _show_labelled(console: Console, block: PageBlock, request: Request | None) -> None:
+    """Print texts beside their label, which is printed only once."""
     label, _, spans_text = block["label"]["text"].partition("\n")
     for index, text_block in enumerate(block["texts"]):
         text, commands = _make_rich_text(text_block), list[str]()
@@ -126,6 +132,7 @@ def _make_rich_table(
     right: Sequence[int],
     **_: object,
 ) -> Table:
+    """Make a table for the terminal; ``right`` contains the indices of right-aligned columns."""
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
     vertical_alignment: Literal["bottom", "top"] = "bottom" if "\n" in "".join(head) else "top"
     for index, title in enumerate(head):

@@ -63,6 +63,7 @@ def make_comparison_page(
 
 
 def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
+    """Write the lines that --verbose adds: source, time span, errors and all findings."""
     source, segment = analysis.source, analysis.segment
     page.add("blank")
     page.write_labelled_text(
@@ -85,7 +86,7 @@ def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
 
 
 def make_card_page(paragraphs: Iterable[Paragraph]) -> Page:
-    """Make a page with the lines of a diagnosis card."""
+    """Make the page with the diagnosis of a flight: fault, effect, actions and σ ratios."""
     page = Page()
     page.add("card", paragraphs=list(paragraphs))
     return page

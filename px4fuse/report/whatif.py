@@ -52,7 +52,8 @@ def list_statistics(analysis: WhatIfAnalysis) -> Iterator[str]:
         text = replayed_text
         if changed_texts:
             changed_text = changed_texts.get(label, "n/a")
-            # Unit or expected NIS after the number. If both texts have the same, it is printed once
+            # Each text is a number, then its unit or the expected NIS. If both texts end with the
+            # same unit, the unit is printed only once
             unit = changed_text.partition(" ")[2]
             text = f"{text.removesuffix(f' {unit}')} → {changed_text}"
         yield f"EKF2 (replay), {label} {text}"
@@ -113,6 +114,7 @@ def select_sweep_summaries(analysis: WhatIfAnalysis) -> tuple[Ekf2Statistics, ..
 
 
 def find_swept_parameter(analysis: WhatIfAnalysis) -> str:
+    """Return the only parameter of the sweep that is not one of the constant changes."""
     (name,) = select_sweep_summaries(analysis)[0].changed.keys() - analysis.changes.keys()
     return name
 
@@ -156,6 +158,7 @@ def _format_number(value: float | Unavailable, unit: str, digits: int = 3) -> st
 
 
 def make_whatif_page(analysis: WhatIfAnalysis) -> Page:
+    """Make the terminal output of ``px4fuse whatif``: statistics, sweep, and replay agreement."""
     page = Page()
     if analysis.uses_estimates and not analysis.changes:
         no_change_text = (

@@ -111,7 +111,7 @@ def _drop_invalid_values(
         for unavailable_type in list_types(annotation):
             if isinstance(unavailable_type, type) and issubclass(unavailable_type, Unavailable):
                 text_fields = {"what": path, "reason": error.reason, "remedy": CHECK_LOG_REMEDY}
-                # keep fields that the Unavailable object also has, for example the errors of a
+                # Keep the fields that the Unavailable type also has, for example the errors of a
                 # filter against ground truth if its NIS is not valid
                 kept_fields = {
                     field.name: _drop_invalid_values(
@@ -121,13 +121,13 @@ def _drop_invalid_values(
                     if field.name not in text_fields and hasattr(value, field.name)
                 }
                 return unavailable_type(**text_fields, **kept_fields)
-        # this field has no place for a reason: the caller removes the value, or the record around
-        # it
+        # A reason cannot be stored in this field: the caller removes the value or its record
         raise
     return value
 
 
 def _require_valid_number(value: float, path: str) -> None:
+    """Raise ``_OutOfBoundsError`` if a number is not finite, or outside the range of its field."""
     low, high = find_field_bounds(path.rpartition(".")[2])
     if not math.isfinite(value):
         raise _OutOfBoundsError(path, f"{path} has a value that is not finite")
@@ -138,6 +138,7 @@ def _require_valid_number(value: float, path: str) -> None:
 def _drop_invalid_fields(
     value: msgspec.Struct, path: str, errors: list[_OutOfBoundsError]
 ) -> msgspec.Struct:
+    """Return a copy of a record in which invalid values are None; append their errors to a list."""
     changes: dict[str, Any] = {}
     for field in fields(value):
         if field.type is msgspec.UnsetType:  # not in the JSON results, for example an array
@@ -156,6 +157,7 @@ def _drop_invalid_fields(
 def _drop_invalid_entries(
     value: Mapping[str, Any], annotation: Any, path: str, errors: list[_OutOfBoundsError]
 ) -> Any:
+    """Return a copy of a mapping without invalid entries; append their errors to a list."""
     checked_elements: dict[str, Any] = {}
     for key, element in value.items():
         try:

@@ -114,6 +114,7 @@ def make_tuning_results(
     comparison: PreparedComparison,
     tuning_by_axis: Mapping[str, AxisTuning | Unavailable],
 ) -> contract.TuningResults:
+    """Make the JSON results of ``px4fuse tune``."""
     return make_results(
         contract.TuningResults,
         command_line(request, "tune"),
@@ -127,6 +128,7 @@ def make_sync_results(
     comparison: PreparedComparison,
     time_offset: SourceTimeOffset | Unavailable,
 ) -> contract.SyncResults:
+    """Make the JSON results of ``px4fuse sync``."""
     return make_results(
         contract.SyncResults,
         command_line(request, "sync"),
@@ -136,6 +138,7 @@ def make_sync_results(
 
 
 def make_whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> contract.WhatIfResults:
+    """Make the JSON results of ``px4fuse whatif``."""
     sweep_start_index = analysis.sweep_start_index
     fields = dict(vars(analysis.statistics))
     replays = fields.pop("whatif")
@@ -152,6 +155,7 @@ def make_whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> con
 
 
 def make_loop_results(request: LoopRequest, loop: Loop, student: Student) -> contract.LoopResults:
+    """Make the JSON results of ``px4fuse loop``: loop closures, corrected paths, and findings."""
     return make_results(
         contract.LoopResults,
         command_line(request),
@@ -167,6 +171,7 @@ def make_loop_results(request: LoopRequest, loop: Loop, student: Student) -> con
 def make_evaluation_results(
     request: EvaluationRequest, evaluation: Evaluation
 ) -> contract.EvaluationResults:
+    """Make the JSON results of ``px4fuse evaluate``."""
     return make_results(
         contract.EvaluationResults,
         command_line(request),
@@ -189,6 +194,7 @@ def make_log_record(flight: Flight) -> contract.Log:
 def _make_flight_fields(
     request: ComparisonRequest, comparison: PreparedComparison
 ) -> dict[str, Any]:
+    """Return the fields that the results of all commands on one flight have in common."""
     track, segment, settings = comparison.source, comparison.segment, comparison.settings
     origin, flight = track.origin, comparison.flight
     available_tracks = (

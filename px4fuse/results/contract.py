@@ -383,6 +383,7 @@ def make_schemas_of_types(types: Collection[type]) -> tuple[list[dict[str, Any]]
     components: dict[str, Any] = {}
 
     def describe_union(union_type: Any) -> dict[str, Any]:
+        """Return the JSON Schema of a union, and add its members to ``record_types``."""
         # msgspec does not write an unset field, so the schema of this field allows no value
         if union_type is msgspec.UnsetType:
             return {"not": {}}
@@ -408,7 +409,7 @@ def to_json_dict(results: msgspec.Struct) -> dict[str, Any]:
 
 
 def round_number(value: float) -> float:
-    """Round a number to ten significant digits, or to six decimals if that is more precise.
+    """Round a number to ten significant digits; large numbers to six decimals.
 
     UNIX times (s) need the six decimals. Further digits differ between processors.
 

@@ -4,8 +4,8 @@ The EKF2 model starts at rest and runs on the simulated IMU and positions. Its e
 linearised about the true attitude.
 
 Outdoors, EKF2 fuses magnetometer and barometer. Indoors, heading and height are the true values
-plus a simulated slow error. KF uses vehicle_attitude. Indoors, this topic is not computed by the
-EKF2 model either, so the results of KF do not depend on EKF2 parameters.
+plus a simulated slow error. KF uses the topic vehicle_attitude. Indoors, this topic is simulated
+without the EKF2 model, so the results of KF do not depend on EKF2 parameters.
 """
 
 from collections.abc import Mapping
@@ -107,6 +107,7 @@ MAX_HEIGHT_FUSION_INTERVAL_IN_POSITION_GAP_S = 0.1
 
 
 def _select_fused_aids(scenario: Scenario) -> tuple[Aid, ...]:
+    """Return the aiding sources that EKF2 fuses: outdoors also magnetometer and barometer."""
     return (scenario.aid, MAG, BAROMETER) if scenario.aid == GNSS_POS else (scenario.aid,)
 
 
@@ -186,8 +187,9 @@ def simulate_ekf2(
     settings = fill_parameters_with_defaults(logged_values, *_select_fused_aids(scenario))
     rules = GNSS_RULES if aid == GNSS_POS else VISION_RULES
     if not int(log_parameters[aid.switch]) & 1:
-        # If bit 0 of EKF2_EV_CTRL is not set, EKF2 tests the positions but never fuses them
-        # (ev_pos_control.cpp). The same effect: no two positions are close enough to start fusion
+        # Bit 0 of EKF2_EV_CTRL (outdoors: EKF2_GPS_CTRL) is not set. EKF2 then tests the positions,
+        # but never fuses them (ev_pos_control.cpp). With a maximum sample interval of 0, fusion
+        # never starts
         rules = replace(rules, max_sample_interval_to_start_s=0.0)
     # EKF2 delays the fusion by the length of its IMU buffer, in steps (estimator_interface.cpp)
     buffer_length = int(np.ceil(1e3 * settings["EKF2_DELAY_MAX"] / PREDICTION_STEP_US))
@@ -377,8 +379,8 @@ def _compute_output(inputs: ReplayInputs, model_run: SegmentRun) -> Ekf2Output:
         -segment.attitude_correction_rad - gyro_bias_rad_s * segment.step_s[:, None]
     )
     gyro_attitude_error_rad = state[0, THETA] + cumulative_sums(attitude_error_increments_rad)
-    # the output predictor then follows the attitude at the fusion horizon, with a delay of
-    # lag_steps
+    # The output predictor corrects its attitude by that at the fusion horizon. The correction is
+    # lag_steps late, because the fusion horizon is lag_steps in the past
     attitude_error_rad = gyro_attitude_error_rad + sum_attitude_corrections(
         state[:, THETA] - gyro_attitude_error_rad, lag_steps, inputs.mean_step_s, inputs.horizon_s
     )

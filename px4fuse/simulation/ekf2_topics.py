@@ -125,6 +125,7 @@ def make_ekf2_topics(
 
 
 def _make_local_position_topic(model_inputs: ReplayInputs, ekf2_output: Ekf2Output) -> Topic:
+    """Make vehicle_local_position from EKF2's output, at the log rate of the topic."""
     logged_steps = np.flatnonzero(
         is_kept_at_rate(to_seconds(ekf2_output.time_us), LOCAL_POSITION_LOG_RATE_HZ)
     )
@@ -295,7 +296,11 @@ def _make_magnetometer_topics(
     ekf2_output: Ekf2Output,
     attitude_rate_hz: float,
 ) -> list[Topic]:
-    """Return the topics that need a magnetometer, or nothing without magnetometer."""
+    """Return vehicle_attitude, estimator_aid_src_mag and estimator_status.
+
+    The result is empty if the EKF2 model does not fuse all axes of the magnetic field: indoors, or
+    with fusion of the magnetic heading only.
+    """
     field, settings = model_run.segment.magnetic_field, model_inputs.settings
     end_step = model_run.events[0].end_step
     if field is None:
@@ -351,7 +356,11 @@ def _make_aid_source_topic(
     is_rejected: BoolArray,
     is_fused: BoolArray,
 ) -> Topic:
-    """Return estimator_aid_src_* of an aiding source, with innovations measurement - state."""
+    """Return estimator_aid_src_* of an aiding source.
+
+    The argument ``innovation`` is measurement minus state. PX4 logs the opposite sign. All arrays
+    have one row per message.
+    """
     fields = {
         **timestamps,
         "observation": observation,

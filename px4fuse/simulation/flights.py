@@ -93,6 +93,7 @@ def simulate(scenario: Scenario, faults: FaultSizes = NO_FAULTS) -> Simulation:
 
 
 def _require_possible_faults(scenario: Scenario, faults: FaultSizes) -> None:
+    """Raise SettingsError if the scenario does not allow a fault, or a fault has no effect."""
     for name in injected_fault_names(faults):
         if scenario.kind not in (kinds := FAULT_TYPES[name].kinds):
             raise SettingsError(f"--mistake {name} requires --kind {' or '.join(kinds)}.")

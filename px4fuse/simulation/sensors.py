@@ -137,6 +137,7 @@ def simulate_imu(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topi
 
 
 def simulate_magnetometer(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
+    """Simulate vehicle_magnetometer: the earth's field (gauss, body FRD) with white noise."""
     time_us = _make_sample_times_us(motion, MAGNETOMETER_RATE_HZ)
     time_s = to_seconds(time_us)
     body_to_ned = motion.compute_body_to_ned(time_s)
@@ -155,6 +156,7 @@ def simulate_magnetometer(scenario: Scenario, faults: FaultSizes, motion: Motion
 
 
 def simulate_barometer(scenario: Scenario, motion: Motion) -> Topic:
+    """Simulate vehicle_air_data: height above sea level (m) with slow error and white noise."""
     time_us = _make_sample_times_us(motion, BAROMETER_RATE_HZ)
     time_s = to_seconds(time_us)
     height_m = HOME_POSITION[2] - motion.compute_true_state(time_s).position_m[:, 2]
@@ -283,6 +285,7 @@ def simulate_land_detector(motion: Motion) -> Topic:
 
 
 def simulate_ground_truth(scenario: Scenario, motion: Motion) -> Topic:
+    """Simulate vehicle_local_position_groundtruth: true position, velocity, acceleration, yaw."""
     time_us = _make_sample_times_us(motion, scenario.truth_rate_hz)
     state = motion.compute_true_state(to_seconds(time_us))
     fields = make_timestamps(time_us) | split_vectors(
@@ -295,8 +298,10 @@ def simulate_ground_truth(scenario: Scenario, motion: Motion) -> Topic:
 def simulate_positions(
     scenario: Scenario, faults: FaultSizes, motion: Motion
 ) -> SimulatedPositions:
-    """Simulate UWB (aisle), VIO (loop) or GNSS (outdoor) positions with injected faults."""
-    # 1. Times of measurement
+    """Simulate positions with injected faults: UWB in an aisle, VIO in a loop, GNSS outdoors.
+
+    The kind of the scenario ("aisle", "loop" or "outdoor") selects the sensor.
+    """
     timing_rng = make_random_generator(scenario, RandomStream.POSITION_TIMES)
     interval_s = 1.0 / scenario.source_rate_hz
     position_count = int((motion.duration_s - FIRST_POSITION_TIME_S) / interval_s)

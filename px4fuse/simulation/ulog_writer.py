@@ -113,6 +113,7 @@ def _pack_keyed_message(message_type: str, key: str, value: bytes) -> bytes:
 
 
 def _make_format_definition(topic: Topic) -> str:
+    """Return the ULog format of a topic, for example "sensor:uint64_t timestamp;float[3] xyz;"."""
     field_types = []
     for name, values in topic.fields.items():
         array_size = f"[{values.shape[1]}]" if values.ndim == 2 else ""
@@ -122,6 +123,8 @@ def _make_format_definition(topic: Topic) -> str:
 
 
 def _encode_data_messages(topic: Topic, topic_id: int) -> list[bytes]:
+    """Encode each message of a topic as a ULog data message: header, then the fields."""
+    # Name, little-endian type and shape of each field
     topic_fields = (
         (name, values.dtype.newbyteorder("<"), values.shape[1:])
         for name, values in topic.fields.items()

@@ -153,7 +153,10 @@ def compute_rms_length_m(difference_m: Array) -> float:
 def _require_sufficient_motion(
     transform: Transform, estimate_m: Array, reference_m: Array, kind: str
 ) -> None:
-    """Raise TrajectoryError if the motion is too small to estimate the rotation."""
+    """Raise TrajectoryError if the motion is too small to estimate the rotation.
+
+    ``transform`` is the fitted alignment of the kind "yaw", "se3" or "sim3".
+    """
     reference_extents_m = _compute_principal_extents_m(reference_m)
     residuals_m = reference_m - transform.apply(estimate_m)
     # The motion that determines the rotation (extent_m) must exceed rounding errors, which are
@@ -172,8 +175,9 @@ def _require_sufficient_motion(
         motion_text = "horizontal motion"
         remedy = "Set `alignment` to none to compare the trajectories without alignment."
     else:
-        # Motion along a line does not determine the rotation around the line: the extent along the
-        # second principal direction is decisive, and the smaller one of both trajectories
+        # Motion along a line does not determine the rotation around the line. Take the smaller
+        # extent of both trajectories along each principal direction; the second extent shows motion
+        # beside the line
         max_extent_m, extent_m, _ = np.minimum(
             transform.scale * _compute_principal_extents_m(estimate_m), reference_extents_m
         )

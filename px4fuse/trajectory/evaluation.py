@@ -291,8 +291,8 @@ def evaluate(
     aligned_estimate, notes = _rotate_to_reference_body(
         _apply_transform(transform, matched_estimate), matched_reference
     )
-    # If the body axes differ by another constant rotation (not between camera and vehicle), also
-    # estimate the lever arm between the origins of both bodies
+    # If the body axes differ by a constant rotation other than camera to vehicle, also estimate the
+    # lever arm between the origins of both bodies
     if not notes and has_other_body_axes(aligned_estimate, matched_reference):
         matched_estimate, notes = _move_to_reference_body(
             matched_estimate, matched_reference, alignment
@@ -357,7 +357,8 @@ def evaluate(
         reference_position_m=matched_reference.position_m,
         position_error_m=position_error_m,
         notes=(*estimate_notes, *reference_notes, *notes),
-        # ``warnings``: frozen poses, jumps, uncertain alignment, and ground truth as estimate
+        # ``warnings`` already contains frozen poses, jumps, an uncertain alignment, and ground
+        # truth that was given as the estimate
         warnings=(
             *warnings,
             *_find_mirror_warnings(
@@ -405,7 +406,8 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
                 f"{yaw_text}motion along a line does not determine the rotation, but z is vertical "
                 f"in both frames ({frames_text})."
             )
-        scale = 1.0  # unknown
+        # The scale is unknown: assume that the scales do not differ
+        scale = 1.0
     se3_text = "Rotation and translation are aligned (6 degrees of freedom): "
     if estimate.kind in _KINDS_WITHOUT_KNOWN_VERTICAL:
         track_without_vertical = estimate
@@ -502,7 +504,10 @@ def _find_better_offset_warnings(
 def _find_mirror_warnings(
     estimate: Trajectory, reference: Trajectory, alignment: AlignmentKind, ate_m: float
 ) -> Iterator[str]:
-    """Return a warning if the estimate fits much better with one axis reversed."""
+    """Yield a warning if the estimate fits much better with the y or z axis reversed.
+
+    ``ate_m`` is the ATE (RMSE, m) without reversal. A small ATE needs no test.
+    """
     if ate_m < MIN_ATE_TO_EXTENT_RATIO_FOR_MIRROR_TEST * np.ptp(reference.position_m, axis=0).max():
         return
     for axis, signs in (("y", (1.0, -1.0, 1.0)), ("z", (1.0, 1.0, -1.0))):
@@ -528,6 +533,7 @@ def _find_comparison_warnings(
     *,
     has_jumps: bool,
 ) -> Iterator[str]:
+    """Yield warnings about trajectories that overlap only in part, and about a wrong scale."""
     if association.coverage_estimate < MIN_EVALUATED_TRAJECTORY_FRACTION:
         yield (
             f"Only {association.coverage_estimate:.0%} of the estimate is evaluated; the reference "

@@ -88,7 +88,7 @@ def cumulative_product(quaternions: Array) -> Array:
     product[0] = quaternions[0]
     # Products up to q_1, q_3, ...: the cumulative products of the pairs
     product[1::2] = cumulative_product(multiply(quaternions[:-1:2], quaternions[1::2]))
-    # Products up to q_2, q_4, ...: the product before, multiplied by this quaternion
+    # Cumulative products at even indices: previous product, multiplied by the quaternion
     product[2::2] = multiply(product[1:-1:2], quaternions[2::2])
     return np.asarray(product / np.linalg.norm(product, axis=1, keepdims=True))
 

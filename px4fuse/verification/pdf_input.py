@@ -134,6 +134,7 @@ def open_strictly(pdf: bytes) -> pypdf.PdfReader:
 
 
 def _check_file(pdf: bytes) -> None:
+    """Test size, start and end of a PDF file, and the sizes of its decompressed streams."""
     if len(pdf) > MAX_PDF_BYTES:
         raise ResultsError(f"the file is larger than {MAX_PDF_BYTES // 1_000_000} MB.")
     if not pdf.startswith(b"%PDF-"):
@@ -196,7 +197,8 @@ def _walk_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObje
     """Yield each PDF dictionary, with True for an action that only runs after a click on a link.
 
     Such an action is the value of the key /A. An object that another key refers to as well is
-    yielded twice, with True and with False.
+    yielded twice, with True and with False. Raise ResultsError if the PDF has too many objects or
+    values.
     """
     visited_references: set[tuple[IndirectObject, bool]] = set()
     missing_object_count = value_count = 0
@@ -232,7 +234,10 @@ def _walk_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObje
 def _find_unexpected_features(
     dictionary: DictionaryObject, runs_only_after_click: bool
 ) -> Iterator[str]:
-    """Yield names of features that px4fuse never writes, for example scripts or external files."""
+    """Yield the features in a PDF dictionary that px4fuse never writes, for example scripts.
+
+    ``runs_only_after_click`` is True if the dictionary is an action of a link: it may open a URL.
+    """
     yield from (key[1:] for key in dictionary if _ACTIVE_CONTENT_KEY_PATTERN.fullmatch(key))
     action, dictionary_type = (
         _read_pdf_name_object(dictionary.get(key)) or "" for key in ("/S", "/Type")

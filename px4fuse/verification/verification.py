@@ -212,7 +212,10 @@ def _repeat_loop_analysis(
 def _draw_report(
     analysis: object, results: ReportedResults, submitted_provenance: Provenance
 ) -> bytes:
-    """Draw the report, but print the library versions of the submitted report."""
+    """Draw the report, but print the library versions of the submitted report.
+
+    Other library versions on this computer are thus no difference of the pages.
+    """
     from px4fuse.report.pdf import render_pdf  # noqa: PLC0415
 
     new_provenance = replace(submitted_provenance, command=results.provenance.command)
@@ -277,6 +280,7 @@ def _compare_with_new_report(
     new_results: ReportedResults,
     draw_report: Callable[[], bytes],
 ) -> Verification:
+    """Compare a submitted report with the report of the repeated analysis."""
     redrawn_pdf = draw_report()
     if redrawn_pdf == pdf:
         return Verification(
@@ -440,6 +444,7 @@ def is_number(value: object) -> bool:
 def _is_within_tolerance(
     path: str, submitted_number: float, new_number: float, is_estimated: bool
 ) -> bool:
+    """Return True if a number in a report agrees with that of the repeated analysis."""
     tolerance = 0.0
     if isinstance(new_number, int):  # counts must be equal, except the iterations of a solver
         if path.endswith(ITERATIONS_FIELD):

@@ -254,6 +254,7 @@ def compare_simulation(simulation: flights.Simulation) -> Comparison:
 def _make_injected_fault(
     name: str, simulation: flights.Simulation, comparison: Comparison
 ) -> InjectedFault:
+    """Return an injected fault with its size, the accepted range of sizes, and its time span."""
     value_field_names = FAULT_TYPES[name].value_field_names
     if not value_field_names:
         return InjectedFault(name)
@@ -298,6 +299,7 @@ def _find_fault_time(
 
 
 def _determine_right_verdict(comparison: Comparison, filter_name: FilterName) -> CorrectVerdict:
+    """Return the right answer about the consistency of a filter, from its analysis by px4fuse."""
     filter_summary = comparison.main.filters[filter_name]
     if not isinstance(filter_summary, FilterSummary):
         return CorrectVerdict("")
@@ -313,6 +315,7 @@ def _find_ekf2_behaviours(
     kinds = size_by_kind.keys()
 
     def list_behaviours(rule: str) -> list[str]:
+        """Return the behaviours that the injected faults cause, by one table of did.toml."""
         return [
             behaviour
             for behaviour, rule_kinds in EKF2_BEHAVIOUR_RULES[rule].items()

@@ -267,9 +267,8 @@ def load_or_verify(
         to_json(results), path_by_sha256, assigned_hashes
     )
     if versions_and_files.get(log_sha256(results)) == "assigned":
-        # the instructor did not give the log that was assigned to the student. Given other logs,
-        # verify() would return "other log", which means that the student analysed a wrong log.
-        # Given no log, it returns "cannot verify"
+        # The instructor did not give the assigned log. Pass no log to verify(), so that its status
+        # is "cannot verify" and not "other log" (the student analysed a wrong log)
         path_by_sha256 = {}
     verification, diagnosis_pdf = verify(results, pdf, path_by_sha256), b""
     if verification.status == "verified" and log_sha256(results) in assigned_hashes:
@@ -333,7 +332,7 @@ def _collect_versions_and_files(
     Keys are library names, and SHA-256 hashes of the input files. A file is "available" in the
     given files, "assigned" (not given, but assigned to a student) or "missing".
     """
-    versions = provenance("")
+    versions = provenance("")  # only the versions are used, not the command
     versions_and_files = {**versions.libraries, "px4fuse": versions.px4fuse}
     for sha256 in find_file_hashes(results):
         if sha256 in path_by_sha256:

@@ -134,7 +134,7 @@ class GradedReport:
 
     @property
     def points(self) -> float:
-        """Sum of the points of all rubric items, confirmed or not."""
+        """Sum of the points of all rubric items, also those that the instructor must confirm."""
         return sum(item.points for item in self.items)
 
     @property

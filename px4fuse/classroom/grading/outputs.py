@@ -60,8 +60,7 @@ GRADES_FOLDER = "grades"
 PSEUDONYMS_FILE = "names.csv"
 QUESTIONS_FILE = "questions.txt"
 PSEUDONYM_TITLES = ("pseudonym", "id", "name")
-# Columns of class.csv before and after the columns with the points for rubric items and the columns
-# with numbers from the reports
+# First columns of class.csv. Columns with points and with numbers of the reports follow
 TITLES_BEFORE_ITEMS = (
     "file",
     "student",
@@ -123,8 +122,8 @@ def write_grading_files(
     """
     class_title = course.title or course.rubric.title or "Class"
     file_stems = make_file_names(grade.student_id or Path(grade.file_name).stem for grade in grades)
-    # the page of the class links the recomputed reports, and may be anonymous; all other files use
-    # ``grades``
+    # Only the web page of the class uses these grades: they contain links to the recomputed
+    # reports, and may be anonymous
     class_page_grades = [
         _copy_redrawn_report(grade, stem, output)
         for grade, stem in zip(grades, file_stems, strict=True)
@@ -194,7 +193,7 @@ def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade],
     """
     pseudonym_by_identity: dict[str, str] = {}
     if path.exists():
-        with protect_inputs(is_active=False):  # the new table replaces this table
+        with protect_inputs(is_active=False):  # not an input: the new table overwrites the file
             sheet = read_csv_sheet(path)
         for row in sheet.rows:
             pseudonym, identity, _ = (
@@ -292,6 +291,7 @@ def format_class_table(grades: Sequence[Grade]) -> str:
 
 
 def _format_csv(titles: Sequence[str], rows: Iterable[Sequence[str | float | None]]) -> str:
+    """Format a table as CSV that Excel opens as UTF-8; texts are never executed as formulas."""
     cell_rows = (
         [
             neutralise_formulas(value) if isinstance(value, str) else format_cell_number(value)
@@ -335,7 +335,10 @@ def feedback_text(grade: Grade, class_name: str = "") -> str:
 
 
 def _format_report_feedback(report: GradedReport, has_proposed_points: bool) -> Iterator[str]:
-    """Yield the lines about the counted report of a student."""
+    """Yield the lines of the feedback about the report that counts for the grade.
+
+    Without ``has_proposed_points``, the sum of the computed points is omitted.
+    """
     yield f"Report   {shorten_text(report.submission)}"
     if student := ", ".join(filter(None, map(shorten_text, (report.student, report.student_id)))):
         yield f"Student  {student}"
@@ -358,6 +361,7 @@ def _format_report_feedback(report: GradedReport, has_proposed_points: bool) -> 
 
 
 def _describe_verification(verification: Verification) -> str:
+    """Return a sentence for the student: result of the verification, reasons, required action."""
     if verification.status == "verified":
         return "Your report is verified: px4fuse computes the same numbers from your log."
     statement = "Your report could not be verified"
@@ -398,8 +402,8 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
     """
     titles = sheet.column_titles
     short_titles = [_ASSIGNMENT_NUMBER_PATTERN.sub("", title) for title in titles]
-    # Canvas computes some columns. One of the first three rows contains READ_ONLY_TEXT in these
-    # columns
+    # The Canvas gradebook marks computed columns with READ_ONLY_TEXT in one of its first three
+    # rows
     editable_column_indices = [
         index
         for index in range(len(titles))
@@ -510,6 +514,7 @@ def fill_grades(
 
 
 def _find_max_points(sheet: Sheet, row: Sequence[str], grade_column_index: int) -> float | None:
+    """Return the maximum points of a student's row; None if the table does not contain them."""
     max_points_texts = (
         cells[grade_column_index]
         for cells in sheet.rows[:3]

@@ -210,6 +210,7 @@ def read_submission(submission: Submission) -> bytes:
 
 
 def _is_gradescope_metadata(name: str) -> bool:
+    """Return True for the metadata file of Gradescope, outside the folders of students."""
     *folders, file = name.split("/")
     is_in_submission_folder = any(folder.startswith("submission_") for folder in folders)
     return file == GRADESCOPE_METADATA_FILE and not is_in_submission_folder
@@ -336,6 +337,7 @@ def _read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
 
 
 def _shorten_name(name: str) -> str:
+    """Return a file name on one line, without its middle part if it is too long."""
     short_name = " ".join(clean_text(name[-10 * MAX_NAME_LENGTH :]).split())
     if len(short_name) > MAX_NAME_LENGTH:
         half_length = MAX_NAME_LENGTH // 2
@@ -421,6 +423,7 @@ def read_gradescope_metadata(text: str) -> dict[str, SubmissionOrigin]:
 
 
 def _read_yaml_value(block: str, key: str) -> str:
+    """Return the value of a key in a YAML block, without quotes; "" if the key is missing."""
     match = re.search(rf"^{key}: *(['\"]?)(.*)\1 *$", block, re.MULTILINE)
     return match[2] if match else ""
 

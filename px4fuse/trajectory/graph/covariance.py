@@ -94,18 +94,20 @@ def gate_edges(graph: model.PoseGraph, tested_edge_indices: IntArray) -> list[Ga
 
 
 def _propagate_covariances(matrices: Array, covariances: Array) -> Array:
+    """Return A P Aᵀ for each matrix A and covariance P, shape (n, d, d)."""
     return matrices @ covariances @ matrices.transpose(0, 2, 1)
 
 
 def _test_edge(
     graph: model.PoseGraph, edge_index: int, residual: Array, covariance: Array
 ) -> GateResult:
+    """Test a loop closure against the odometry with the χ² test."""
     vertices = (
         int(graph.ids[graph.first_nodes[edge_index]]),
         int(graph.ids[graph.second_nodes[edge_index]]),
     )
-    # A closure can measure only some directions of the relative pose, for example no rotation.
-    # Project the residual and its covariance by odometry on these directions
+    # A closure may measure only some directions of the relative pose, for example no rotation.
+    # Project the residual and its odometry covariance on these directions
     directions, closure_variance = model.compute_observed_directions(graph.information[edge_index])
     degrees_of_freedom = len(closure_variance)
     projected_residual = directions.T @ residual

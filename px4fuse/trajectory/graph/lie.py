@@ -189,13 +189,15 @@ def _make_skew_matrix(phi: Array) -> Array:
 def accumulate_poses(steps: Array) -> Array:
     """Compose n relative motions to n + 1 poses. The first pose is the identity.
 
+    Columns of a pose: x, y, heading; or position and quaternion.
+
     Parameters
     ----------
     steps : ndarray, shape (n, 3) or (n, 7)
     """
-    # Prefix products by doubling: each row is the product of the last 1, 2, 4, ... motions up to
-    # it. A round multiplies it by the row composed_count before, which contains the motions before.
-    # compose returns a new array, so all rows of a round use the rows of the round before
+    # Prefix products by doubling: row i contains the product of the last composed_count motions up
+    # to motion i. Multiply it by row i - composed_count, which contains the motions before these.
+    # compose returns a new array, so all rows of a round use the rows of the previous round
     poses = np.vstack([identity(steps.shape[-1]), steps])
     composed_count = 1
     while composed_count < len(poses):
@@ -242,9 +244,10 @@ def _compute_square_term_factor(theta: Array) -> Array:
 
 
 def _compute_square_term_derivative_over_theta(theta: Array) -> Array:
-    """Return f'(theta) / theta for the factor f of :func:`_compute_square_term_factor`.
+    """Return f'(theta) / theta for the function f of :func:`_compute_square_term_factor`.
 
-    The derivative of the inverse left Jacobian contains this term.
+    f(theta) = (1 - theta/2 cot(theta/2)) / theta^2, with the rotation angle theta (rad). The
+    inverse right Jacobian of SE(2) and SE(3) contains f'(theta) / theta.
     """
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
     half_cot_derivative = 0.5 / np.tan(0.5 * t) - 0.25 * t / np.sin(0.5 * t) ** 2

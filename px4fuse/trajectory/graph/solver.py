@@ -55,9 +55,9 @@ _MAX_GNC_STAGES = 100
 # Maximum number of loop closures that are tested again after graduated non-convexity rejected them
 _MAX_TRIALS_TO_RESTORE_CLOSURES = 20
 _MAX_REWEIGHTING_ROUNDS = 20
-# The information matrices of the edges can be too large, so that loop closures are rejected. They
-# are divided by an estimated factor, if it is at least the following value. False loop closures
-# alone can cause smaller estimates
+# Too large information matrices of the edges would reject right loop closures. They are divided by
+# an estimated factor of at least this value. Smaller factors may be an effect of false loop
+# closures alone, so they are ignored
 MIN_INFORMATION_SCALE_FACTOR = 2.5
 # Minimum number of loop closures for an estimate of the factor by which the information matrices
 # are too large
@@ -85,6 +85,8 @@ class Solution(Record, kw_only=True):
 
 @dataclass(frozen=True)
 class _Optimum:
+    """Result of Levenberg-Marquardt: residuals with the poses, and number of accepted steps."""
+
     residuals: Residuals
     iterations: int
     converged: bool
@@ -209,6 +211,7 @@ def _solve_gnc(
     cost_if_dropped = 2.0 * gammaincinv(half_degrees_of_freedom, KEPT_CLOSURE_PROBABILITY)
 
     def compute_truncated_cost(residuals: Residuals, edge_weights: Array) -> float:
+        """Return the cost of the kept edges, plus the fixed cost of each dropped closure."""
         return 0.5 * float(np.sum(np.where(edge_weights > 0.0, residuals.chi2, cost_if_dropped)))
 
     # The result depends on the start: try the least-squares optimum and the initial poses
@@ -241,9 +244,9 @@ def _run_gnc(
     """Run graduated non-convexity from one start (Yang 2020, algorithm 1, eq. 13 and 14)."""
     residuals = start_residuals
     iteration_count = 0
-    # 1. Minimise a cost that is nearly convex at first, and truncated at chi2_bound at last: the
-    # control parameter increases in each stage, until all weights are 0 or 1. Initial control
-    # parameter: the inverse of the maximum over all edges (Yang 2020, section V)
+    # Minimise a cost that is nearly convex at first, and truncated at chi2_bound at last. The
+    # control parameter increases in each stage, until all weights are 0 or 1. It starts at 1 ÷
+    # maximum of 2 χ² / chi2_bound - 1 over all edges (Yang 2020, section V)
     inverse_control_parameter = float(np.max(2.0 * residuals.chi2 / chi2_bound - 1.0))
     if inverse_control_parameter > 0.0:
         control_parameter = 1.0 / inverse_control_parameter
