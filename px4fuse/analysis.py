@@ -53,8 +53,8 @@ class Analysis(Comparison, Estimates, Reruns):
         """Return the request, or raise SettingsError for an analysis without a request."""
         if self.request is None:
             raise SettingsError(
-                "The analysis contains no options of px4fuse.compare, which reports, web pages and "
-                "summaries need.",
+                "The analysis contains no options of px4fuse.compare. Reports, web pages and "
+                "summaries need these options.",
                 "Pass an analysis from px4fuse.compare.",
             )
         return self.request
@@ -130,7 +130,10 @@ class WhatIfAnalysis:
 
 
 def find_failed_checks(analysis: Analysis | AidingSourceAnalysis) -> dict[str, str]:
-    """Return the axes and aiding sources for which EKF2 is not consistent, with the reason."""
+    """Return the axes along which EKF2 is overconfident, and its faulty aiding sources.
+
+    The result maps "EKF2, " and axis, or the name of the aiding source, to the verdict.
+    """
     failed_verdicts = {}
     if isinstance(analysis, Analysis):
         for name, axis in analysis.axes.items():

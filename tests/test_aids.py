@@ -160,7 +160,7 @@ def test_aiding_source_report_names_its_noise_parameter(
     assert evaluate(aid_log(own=False, **parameters), name).noise_from == ""
 
 
-def test_aiding_source_logged_rarely_is_unfused_after_longer_gap() -> None:
+def test_rarely_logged_aiding_source_is_unfused_after_longer_gap() -> None:
     """Rows of zeros are samples that EKF2 logged between two measurements."""
     log = aid_log(own=False, enabled=steps((0.0, 1.0)))
     decimated = replace(log, samples=log.samples.iloc[::10])
@@ -281,7 +281,9 @@ def test_innovation_sign_is_the_same_for_each_px4_release(generation, tmp_path):
 # ---------------------------------------------------------------------------- reporting
 
 
-def test_compare_option_checks_exits_with_1_on_sensor_fault(tmp_path, monkeypatch, capsys) -> None:
+def test_compare_with_option_checks_exits_with_1_on_sensor_fault(
+    tmp_path, monkeypatch, capsys
+) -> None:
     log, report = gnss_log("v1.16").write(tmp_path / "a.ulg"), tmp_path / "a.pdf"
     code, _, err = run_main(monkeypatch, capsys, "compare", log, "--checks", "-o", report)
     bad = [each.label for each in evaluate_aids(read_log(log)).values() if each.is_faulty]

@@ -468,7 +468,7 @@ def test_align_position_file_on_periodic_path_needs_clock_offset(yaw: Any) -> No
     assert alignment.residual_rms_m == pytest.approx(0.11, abs=0.02)
 
 
-def test_align_position_file_warns_of_second_time_offset() -> None:
+def test_align_position_file_warns_of_other_likely_time_offset() -> None:
     def accelerating_passes(time_s: Array, heading_deg: float, length_m: float) -> Array:
         along = 5.0 * (1.0 - np.cos(2.0 * np.pi * (time_s / 20.0 + time_s**2 / 2e5)))
         return np.stack([along, 0.0 * along, 0.0 * along], axis=1)

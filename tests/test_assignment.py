@@ -129,7 +129,7 @@ class TestDraw:
         names = {choice.name for one in flights for choice in choices_of(one)}
         assert names == {choice.name for choice in ASSIGNABLE_FAULTS if choice.flight_kind == kind}
 
-    def test_mixed_assignments_have_set_fraction_of_loop_flights(self):
+    def test_mixed_assignments_have_requested_fraction_of_loops(self):
         mixed = [assign_random_flight(SECRET, f"s{n}", "mixed") for n in range(1000)]
         kinds = Counter(one.scenario.kind for one in mixed)
         assert kinds["loop"] / 1000 == pytest.approx(LOOP_FLIGHT_PROBABILITY, abs=0.05)

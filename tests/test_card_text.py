@@ -29,7 +29,7 @@ def test_text_plot_marks_error_to_sigma_ratio_on_log_scale(ratio, column, mark) 
     assert (len(drawn), drawn.index(mark)) == (41, column)
 
 
-def test_text_plot_without_ratio_still_shows_consistent_range() -> None:
+def test_text_plot_without_sigma_ratio_shows_consistent_range() -> None:
     assert re.fullmatch("1/10 ─{14}░{5}─{14} 10", draw_sigma_ratio(None, "source"))
     assert re.fullmatch("1/10 ─{13}░{7}─{13} 10", draw_sigma_ratio(None, "truth"))
 

@@ -546,7 +546,7 @@ def test_time_offset_interval_widens_if_flight_parts_differ() -> None:
     assert found.is_determinable
 
 
-def test_time_offset_interval_does_not_widen_if_parts_agree() -> None:
+def test_time_offset_interval_is_not_wider_if_flight_parts_agree() -> None:
     found = widen_for_scatter(stated(0.01, -0.01, 0.015, -0.02, 0.0), "the positions drift")
     assert (found.interval_s, found.sigma_s) == (pytest.approx((-0.021, 0.019)), 0.01)
 

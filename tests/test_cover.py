@@ -205,7 +205,7 @@ def test_report_cover_omits_plots_of_missing_data(changes, titles) -> None:
     assert len(set_by_typst(page)) == 1
 
 
-def test_cover_map_title_states_distance_of_ekf2_outside_map() -> None:
+def test_cover_map_title_states_how_far_ekf2_is_outside_the_map() -> None:
     flight = aisle_flight(duration_s=60.0)
     flight.ekf2.state.loc[30.0:31.0, "east_m"] += 40.0
     analysis = unexplained(compare(flight))

@@ -95,7 +95,7 @@ def test_diff_of_estimated_measurement_noise_reports_intervals(clean):
     assert sigma_z.label == "SIGMA_Z estimate, horizontal"
     assert sigma_z.a_interval == clean.results.tuning["horizontal"].sigma_z_m_interval
     assert sigma_z.a_interval[1] < 0.15 < sigma_z.b_interval[0]
-    assert any(text.startswith("Mean NIS of KF, aisle: ") for text in found.worse)
+    assert any(text.startswith("Mean NIS of KF, axis of largest motion: ") for text in found.worse)
 
 
 def test_diff_with_larger_ekf2_noise_reports_worse_ekf2_nis(clean):
@@ -103,7 +103,11 @@ def test_diff_with_larger_ekf2_noise_reports_worse_ekf2_nis(clean):
     (noise,) = [one for one in found.settings if one.name == "EKF2_EVP_NOISE"]
     assert (noise.a, noise.b) == (0.1, 0.3)
     assert "ekf2_underconfident" in {one.id for one in found.findings if one.only_in == "B"}
-    (text,) = [text for text in found.worse if text.startswith("Mean NIS of EKF2, aisle: ")]
+    (text,) = [
+        text
+        for text in found.worse
+        if text.startswith("Mean NIS of EKF2, axis of largest motion: ")
+    ]
     assert "(consistent) → " in text
     assert text.endswith(" times too large).")
     assert not any("NIS of KF" in text for text in found.worse)

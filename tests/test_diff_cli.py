@@ -58,13 +58,15 @@ def test_diff_exit_code_is_1_if_verdict_is_worse(settings, changed):
     first, second = (path.with_suffix(".json") for path in settings)
     beside = json.loads(run_checked("diff", first, second, "--json", "-", code=1).stdout)
     assert beside["numbers"] == changed["numbers"]
-    assert any(text.startswith("Mean NIS of KF, aisle: ") for text in beside["worse"])
+    assert any(
+        text.startswith("Mean NIS of KF, axis of largest motion: ") for text in beside["worse"]
+    )
     said = run_checked("diff", first, second, code=1).stdout
-    assert "Worse    Mean NIS of KF, aisle: " in said
+    assert "Worse    Mean NIS of KF, axis of largest motion: " in said
     nothing = json.loads(run_checked("diff", settings[0], first, "--json", "-").stdout)
     assert [nothing[part] for part in ("settings", "numbers", "findings", "worse")] == [[]] * 4
     assert (
-        "B has no error and no inconsistent filter that A does not have."
+        "B has no new finding of severity error and no new inconsistent filter."
         in run_checked("diff", *settings[::-1]).stdout
     )
 

@@ -43,7 +43,7 @@ def test_metres_per_degree_use_curvature_radii_of_ekf2(latitude_deg: float) -> N
     assert np.subtract(higher, (north, east, down)) == pytest.approx([1e-4, 1e-4, 0.0], abs=1e-12)
 
 
-def test_ekf2_position_scale_factor_is_1_without_gnss_origin() -> None:
+def test_map_projection_scale_factor_is_1_without_gnss_origin() -> None:
     assert compute_internal_to_published_position_ratio(record(45.0, north_m=3.0)) == 1.0
     assert compute_internal_to_published_position_ratio(record(np.nan)) == 1.0
 

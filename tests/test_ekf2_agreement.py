@@ -134,7 +134,7 @@ def test_replay_with_logged_rejections_decides_agreement_verdict(axis, good):
                        rejected_fraction_replayed=0.3)  # fmt: skip
     found = judge_agreement_with_logged_rejections(own_gate, logged_gate)
     assert found.good is good
-    assert found.reason.startswith("in a replay that rejects the same samples as EKF2, ")
+    assert found.reason.startswith("if the EKF2 replay rejects the same samples as in the log, ")
     assert (found.decisions_same, found.rejected_fraction_replayed) == (0.9, 0.2)
     assert found.axes == logged_gate.axes
     # above half of the positions the published position is not tested, but the correlation is

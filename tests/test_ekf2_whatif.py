@@ -117,7 +117,7 @@ def test_kf_ekf2_difference_without_common_time_is_unavailable(model):
 # ----------------------------------------------------------- cases with a known answer
 
 
-def test_filters_between_kf_and_ekf2_differ_in_one_property_each():
+def test_each_step_from_kf_to_ekf2_changes_one_filter_property():
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
     received = made(ReceivedPositions)
     plain = (made(ReplaySegment, flow=None, height_samples=None),)
@@ -318,7 +318,7 @@ def test_ekf2_replay_with_delay_too_large_for_fusion_is_rejected(model, monkeypa
     assert "--set EKF2_DELAY_MAX" in error.value.remedy
 
 
-def test_replay_with_over_35_percent_rejections_is_unpredictable(model):
+def test_replay_with_over_35_percent_rejections_is_unreliable(model):
     unpredictable, some, none = what_if(
         model, [{"EKF2_EVP_NOISE": 0.02}, {"EKF2_EVP_NOISE": 0.05}, {"EKF2_EVP_NOISE": 0.2}]
     ).whatif
@@ -329,7 +329,7 @@ def test_replay_with_over_35_percent_rejections_is_unpredictable(model):
     assert none.is_predictable
 
 
-def test_replay_result_sensitive_to_2_mm_noise_is_unpredictable(model, monkeypatch):
+def test_replay_result_that_2_mm_noise_changes_is_unreliable(model, monkeypatch):
     """Vary NIS, rejections and RMSE just inside and just outside their limits."""
     north = AxisStatistics(1.0, (0.9, 1.1), 0.1, 0.1, 0.1)
     base = Ekf2Statistics(

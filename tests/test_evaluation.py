@@ -377,7 +377,7 @@ def test_default_alignment_scales_only_slam_of_unknown_scale(
     assert why in reason
 
 
-def test_evaluate_straight_track_with_known_vertical_fits_yaw() -> None:
+def test_straight_track_with_known_vertical_is_aligned_in_yaw() -> None:
     x, y = line(0.02)
     aisle = Trajectory("aisle", "truth", np.arange(len(x)) * 0.1, y, None, "NED")
     got = evaluate(replace(aisle, kind="unknown", position_m=x), aisle)

@@ -647,6 +647,6 @@ def test_explain_command_with_unknown_fault_exits_with_2(
     code, out, err = run_main(monkeypatch, capsys, "explain", typed)
     assert (code, out) == (2, "")
     assert err == (
-        f"px4fuse: '{typed}' is not a finding. {suggestion}"
+        f"px4fuse: unknown finding id '{typed}'. {suggestion}"
         "For a list of findings, run px4fuse explain.\n"
     )

@@ -92,7 +92,7 @@ def test_batch_page_omits_column_without_numbers() -> None:
     assert "nan" not in text.split("<script")[0].split("</style>")[1]
 
 
-def test_batch_page_without_compared_logs_lists_failed_logs() -> None:
+def test_batch_page_without_any_results_lists_failed_logs() -> None:
     assert "0 logs" in format_html(artificial_logs(0), "Bench", "px4fuse 1")
     table = artificial_logs(30)
     failed = table[table["status"] == "failed"].reset_index(drop=True)

@@ -67,7 +67,7 @@ def flying(noise_m_s: float = 0.3) -> Ekf2Model:
     return replace(model(), inputs=replace(inputs, segments=segments))
 
 
-def test_mean_optical_flow_is_recovered_from_low_pass_log(tmp_path):
+def test_mean_flow_is_recovered_from_low_pass_filtered_log(tmp_path):
     log = gnss_log("v1.16")
     log["estimator_states"]["states"][:, :4] = [1.0, 0.0, 0.0, 0.0]
     at = stamps(20.0, 50.0)

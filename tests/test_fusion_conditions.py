@@ -94,7 +94,7 @@ def clock(name: str) -> ClockConversion:
         (gnss(parameters={"EKF2_GPS_CTRL": 2.0}), "switch", ("Set EKF2_GPS_CTRL to 3",)),
         (gnss(parameters={"EKF2_AID_MASK": 8.0}), "switch", ("Set EKF2_AID_MASK to 9",)),
         (gnss(0b1001, 5.0, parameters={**V114, "EKF2_REQ_EPH": 3.0}), "checks",
-         ("3D fix (failed 100 %", "limit EKF2_REQ_EPH 3 m")),
+         ("3D fix (check failed 100 %", "limit EKF2_REQ_EPH 3 m")),
         # EKF2_GPS_CHECK without the bit of this check
         (gnss(0b10, parameters={**V114, "EKF2_GPS_CHECK": 0b10}), None, ()),
         (gnss(status_flags={"gnss_fault": on(1.0)}), "fault", ("EKF2_GPS_MODE",)),
@@ -159,7 +159,7 @@ def test_position_that_ekf2_declares_invalid_is_reported(
         ("cases/case10.ulg", "vehicle_visual_odometry", ("UNIX time", "UXRCE_DDS_SYNCT")),
         ("logs/conventions/quality_low.ulg", None, ("quality is 30", "EKF2_EV_QMIN 50")),
         ("logs/conventions/stamps_ms.ulg", None, ("in milliseconds", "microseconds")),
-        ("logs/gps/main202603_gps_outage_flow.ulg", None, ("3D fix (failed 96 %", "23.9 s")),
+        ("logs/gps/main202603_gps_outage_flow.ulg", None, ("3D fix (check failed 96 %", "23.9 s")),
         ("logs/simulated/v1.16.1_aisle_nlos.ulg", None, ("no position for 8.2 s",)),
         ("logs/conventions/clean_uwb.ulg", None, ()),
         ("logs/flown/eg1_base.ulg", None, ()),

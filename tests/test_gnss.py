@@ -518,7 +518,7 @@ def test_ekf2_replay_with_true_gnss_delay_reduces_heading_error(models):
 
 
 @pytest.mark.reallogs
-def test_ekf2_replay_without_aiding_source_predicts_error(models):
+def test_ekf2_replay_without_aiding_source_predicts_state_error(models):
     """The error after 93 s agrees with the noise of the remaining aiding sources."""
 
     def without(*names: str) -> tuple[Ekf2Statistics, float]:

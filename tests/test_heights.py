@@ -234,7 +234,7 @@ def test_ekf2_replay_without_height_sensor_reports_height_drift() -> None:
     assert ". The heights of both replays differ by at most " in found.notes[-1]
 
 
-def test_ekf2_replay_is_unpredictable_after_5_s_height_rejection() -> None:
+def test_replay_gives_no_prediction_after_5_s_height_rejection() -> None:
     """EKF2 resets the height after 5 s, which the model does not contain."""
     flight = outdoors()
     jump = flight.barometer.copy()

@@ -71,7 +71,7 @@ def test_python_fault_list_equals_that_of_command_line(sample_log, analysis, tmp
     assert px4fuse.find(analysis) == found
 
 
-def test_compare_of_flight_equals_compare_of_its_log_path(sample_log, analysis):
+def test_compare_of_flight_object_equals_compare_of_log_path(sample_log, analysis):
     again = px4fuse.compare(px4fuse.read_log(str(sample_log)), sigma_z_m=0.2)
     pd.testing.assert_frame_equal(px4fuse.table(again), px4fuse.table(analysis))
     assert px4fuse.find(again) == px4fuse.find(analysis)

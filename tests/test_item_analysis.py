@@ -82,7 +82,7 @@ def test_oral_exam_asks_first_about_wrong_and_missed_faults() -> None:
     assert "You named dropout" in questions[0][0]
     assert "nlos, yaw" in questions[0][1]
     assert "You named nlos" in questions[1][0]
-    assert "right fault size 8.5 to 11.5 %" in questions[1][1]
+    assert "accepted fault size 8.5 to 11.5 %" in questions[1][1]
     assert "Your flight also has this fault" in questions[2][0]
     assert "Your answer: yaw" in questions[3][0]
     assert "Right: delay" in questions[3][1]

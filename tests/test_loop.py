@@ -169,7 +169,7 @@ def test_loop_correction_methods_agree_without_heading_error(sample, sample_loop
     np.testing.assert_allclose(plain.position_m, turned.position_m, atol=1e-9)
 
 
-def test_loop_closure_error_with_known_landing_equals_truth(
+def test_loop_closure_error_with_landing_position_equals_truth(
     sample: LoopSource, sample_loop: Loop
 ) -> None:
     forward, right, _ = sample_loop.true_end.displacement_vector_m  # the vehicle heads along x
@@ -325,7 +325,7 @@ def test_loop_without_ground_truth_assumes_landing_at_take_off(
     assert find_loop_findings(analyse_loop(sample, landed_at=Landing(0.0, 0.0))) == ()
 
 
-def test_loop_and_compare_report_the_same_orientation_fault(
+def test_loop_and_compare_commands_report_same_orientation_fault(
     sample: LoopSource, monkeypatch: Any
 ) -> None:
     track = next(one for one in sample.flight.positions if one.orientation is not None)

@@ -183,7 +183,7 @@ def test_magnetic_field_is_from_ekf2_topic_if_sensor_log_is_slow(tmp_path: Path)
     assert list(field) == ["forward_gauss", "right_gauss", "down_gauss", "fused_3d"]
 
 
-def test_magnetic_field_is_recovered_from_low_pass_innovations() -> None:
+def test_magnetic_field_is_recovered_from_filtered_innovations() -> None:
     """The vehicle rotates, EKF2's attitude differs from the published one, the sensor is noisy."""
     count, every, rows = 12, 7, 30
     interval_s, dt = 0.5 / every, 0.008

@@ -224,7 +224,7 @@ def test_mcp_call_with_invalid_file_or_argument_is_an_error(tmp_path: Path, serv
         ("diagnose", {"log": "nothing.ulg", "position": "/etc/hosts"}, "hosts is outside the"),
         ("evaluate", {"estimate": f"{outside}:vio", "reference": "b"}, no_root),
         ("explain", {"finding_id": "source_outlier"}, "Did you mean source_outliers?"),
-        ("explain", {"finding_id": "--help"}, "'--help' is not a finding"),
+        ("explain", {"finding_id": "--help"}, "unknown finding id '--help'"),
         ("remove", {}, "'remove' is not a tool. Choose from info, diagnose"),
     ]
 

@@ -163,7 +163,7 @@ def test_report_on_wrong_kf_noise_states_ratio_to_fitted_noise() -> None:
     small = tuned(NoiseEstimate(2.0, 1.9, 2.1), NoiseEstimate(9.0, 8.9, None))
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=small))
     assert (
-        "too small: KF follows the positions slowly. SIGMA_A is 1 m/s²; its maximum-likelihood "
+        "too small: KF lags behind the positions. SIGMA_A is 1 m/s²; its maximum-likelihood "
         "estimate is 9 m/s². KF's gain is too small." in worse.message
     )
     assert named(noises.detect_wrong_settings, analysis(source=MOVING)) == {}

@@ -78,5 +78,5 @@ def test_each_option_of_compare_changes_the_results(name: str) -> None:
 def test_unknown_kind_of_position_source_raises_an_error() -> None:
     for origin in SOURCE_ORIGINS:
         assert find_source_origin(origin.kind, origin.route) is origin
-    with pytest.raises(ValueError, match="no position source of kind"):
+    with pytest.raises(ValueError, match="unknown position source: kind 'lidar'"):
         find_source_origin("lidar", "as received")

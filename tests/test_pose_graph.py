@@ -390,7 +390,7 @@ def test_p_value_of_true_loop_closures_is_uniform(dimension, information, freedo
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("is_back", [False, True])
-def test_loop_closure_gate_distance_equals_gtsam(dimension: int, is_back: bool) -> None:
+def test_loop_closure_mahalanobis_distance_equals_gtsam(dimension: int, is_back: bool) -> None:
     """For an exact closure the distance depends on the odometry covariance only."""
     gtsam = pytest.importorskip("gtsam")
     graph = odometry_graph(dimension, 1e-3)
@@ -436,7 +436,7 @@ def test_loop_closure_gate_without_odometry_edge_raises_error() -> None:
     assert gate_edges(graph, np.zeros(0, int)) == []
 
 
-def test_8_times_too_large_information_keeps_loop_closures() -> None:
+def test_loop_closures_with_8_times_information_are_accepted() -> None:
     graph = odometry_graph(2, 3e-3)
     ends = np.arange(4, 34)
     truth, information = graph.poses, np.tile(graph.information[:1], (len(ends), 1, 1))

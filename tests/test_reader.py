@@ -501,7 +501,7 @@ def test_position_reconstructed_from_innovation_equals_measured(read, generation
     assert len(track.samples) >= len(ev_stamps(10.0)) - 1
 
 
-def test_innovations_before_ekf2_state_cause_no_height_note(sample_log):
+def test_innovations_before_first_ekf2_state_add_no_height_note(sample_log):
     track, _ = choose_source(read_log(sample_log.with_name("loop_vio.ulg")), STATE)
     assert len(track.invalid_reasons) > 0
     assert track.notes == ()

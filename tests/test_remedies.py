@@ -271,7 +271,7 @@ def test_clock_offset_option_does_not_hide_wrong_gnss_delay(sample: Analysis) ->
     assert not list(source_clock.detect_wrong_delay(analysis, analysis.time_offset))
 
 
-def test_sender_without_timesync_is_advised_to_answer_it_first() -> None:
+def test_sender_without_timesync_is_advised_to_answer_timesync() -> None:
     """PX4 ignores the timestamps of a sender that does not answer TIMESYNC."""
     for method, expected in ("arrival time", "Answer TIMESYNC"), ("TIMESYNC", "Subtract 0.400 s"):
         source: Any = SimpleNamespace(clock_map=SimpleNamespace(method=method))

@@ -51,7 +51,7 @@ def test_longest_of_two_flights_is_analysed(shared_logs: Path) -> None:
     assert "the others: 6.0 to 24.0 s (--start 6.0 --end 24.0)" in segment.reason
 
 
-def test_aiding_source_with_zero_innovations_counts_as_fused(shared_logs: Path) -> None:
+def test_aiding_source_whose_innovations_are_0_counts_as_fused(shared_logs: Path) -> None:
     analysis = analyse(shared_logs, "baro_and_compass_fused_all_the_time")
     assert "aid_not_fused" not in {finding.id for finding in analysis.findings}
 

@@ -227,7 +227,7 @@ def test_ekf2_is_rerun_with_px4_default_of_each_changed_noise() -> None:
     assert tried[1:] == [{"EKF2_ACC_NOISE": 0.35}, {"EKF2_GYR_NOISE": 0.015}]
 
 
-def test_rerun_explaining_below_half_of_excess_nis_is_no_cause() -> None:
+def test_rerun_with_small_reduction_of_excess_nis_is_no_cause() -> None:
     def one(change: Any, explains: float, *, into: bool = False) -> Rerun:
         after = RunStatistics(innovations=10 if into else 10**6, nis_mean=9.0 ** (1.0 - explains))
         return Rerun(

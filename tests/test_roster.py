@@ -175,7 +175,7 @@ def at(platform: str, number: str = "", name: str = "", **more: str) -> Submissi
         (at("moodle", "99", "Jane"), None),
     ],
 )
-def test_student_is_identified_by_platform_id_before_name(origin, place) -> None:
+def test_student_is_identified_by_learning_platform_id_first(origin, place) -> None:
     assert CLASS.find_student_index(origin.person) == place
 
 
@@ -249,7 +249,7 @@ def test_fill_grades_matches_anonymous_row_by_participant_number(tmp_path) -> No
     assert fill_grades(sheet, GRADES, course(people), TEXTS)[0].rows[0][5] == "87.5"
 
 
-def test_fill_grades_scales_points_to_the_platform_maximum(tmp_path) -> None:
+def test_fill_grades_scales_points_to_learning_platform_maximum(tmp_path) -> None:
     sheet = table(tmp_path, MOODLE)
     scaled = fill_grades(sheet, GRADES, course(worksheets=(sheet,), scale=50.0), TEXTS)[0]
     maximum = GRADES[0].max_points

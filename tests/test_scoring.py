@@ -215,7 +215,7 @@ class TestForm:
             assert (points, "not about the log that you were given" in comment) == (0.0, True)
 
     @pytest.mark.parametrize(("submitter_id", "points"), [("", 0.0), ("s01", 30.0), ("zz", 0.0)])
-    def test_scoring_uses_platform_id_instead_of_mistyped_report_id(self, submitter_id, points):
+    def test_id_of_learning_platform_replaces_mistyped_report_id(self, submitter_id, points):
         mistyped = with_form(["dropout"], student__id="s02")
         items = assess_results(mistyped, key=key(), submitter_id=submitter_id).items
         assert [item.points for item in items if "faults" in item.title] == [points]
@@ -258,9 +258,9 @@ class TestScore:
     @pytest.mark.parametrize("student_id", ["s02", "S02", "ѕ02", "s77", "", " "])
     def test_log_of_other_student_counts_only_if_rubric_allows(self, student_id):
         given = changed_results(student__id=student_id)
-        said = f"the id {student_id}" if student_id.strip() else "no id"
+        said = f"the student id {student_id}" if student_id.strip() else "no student id"
         assert (
-            f"assigned to student s01, but the report states {said}"
+            f"assigned to student s01, but the report contains {said}"
             in assess_results(given, key=key()).instructor_action
         )
         for rule, earns in (("zero", False), ("count", True)):

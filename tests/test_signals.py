@@ -325,7 +325,7 @@ def test_ekf2_position_jump_at_origin_shift_is_removed(at, good):
 
 
 @pytest.mark.parametrize("reset_s", [4.0, 10.0, 15.0])
-def test_ekf2_reset_that_corrects_drift_is_not_removed(reset_s):
+def test_ekf2_reset_that_corrects_drift_is_kept_in_ekf2_track(reset_s):
     """EKF2 drifts by 2 m and a reset moves it back to the source."""
     drift = np.where(reset_s > STATE_TIME, 2.0 * STATE_TIME / reset_s, 0.0)
     resets = [Reset(reset_s, kind, (-2.0, 0.0, 0.0)) for kind in ("position", "velocity")]
@@ -350,7 +350,7 @@ def test_removing_position_reset_keeps_ekf2_height_reset():
     assert "height" in statement.split("EKF2 resets")[2]
 
 
-def test_ekf2_height_reset_is_not_removed_without_source_height():
+def test_ekf2_height_reset_stays_in_track_without_source_height():
     """A source without height contains no information on a change of the frame."""
     track = noisy_track()
     blind = replace(track, samples=track.samples.assign(down_m=np.nan))
@@ -370,7 +370,7 @@ def test_ekf2_height_reset_is_not_removed_without_source_height():
     (0.5, ""), (1.0, ""), (1.1, "kept"), (17.9, "kept"), (18.0, "kept"),
     (18.5, ""),
 ])  # fmt: skip
-def test_ekf2_resets_outside_evaluated_segment_are_not_removed(reset_s, said):
+def test_ekf2_resets_outside_evaluated_segment_stay_in_the_track(reset_s, said):
     """A reset at the start defines the frame; one at the end affects the last sample only."""
     ekf2 = ekf2_of(np.zeros(3), [Reset(reset_s, "position", (5.0, 5.0, 0.0))])
     state, statement = remove_origin_resets(ekf2, noisy_track(), Segment(1.0, 18.0, ""))

@@ -161,7 +161,7 @@ def test_simulated_aisle_flight_has_requested_length_and_yaw(yaw):
 
 
 @pytest.mark.parametrize("texts", [[], ["vibration=0.5"]])
-def test_simulated_imu_noise_mean_per_kf_step_has_requested_sd(texts):
+def test_simulated_imu_noise_per_kf_step_has_requested_sigma(texts):
     scenario = Scenario(seed=3, passes=4, wander_m=0.0, **IDEAL)
     simulation = simulate(scenario, parse_faults(texts))
     imu = to_flight(simulation).imu

@@ -159,7 +159,7 @@ def test_read_log_detects_unit_and_clock_of_timestamps(tmp_path, stamp, clock):
     ("another clock", "Synchronise the clocks"),
     ("milliseconds", "Set timestamp_sample to the time of measurement"),
 ])  # fmt: skip
-def test_advice_on_timestamps_is_clock_sync_or_correct_unit(clock, action):
+def test_timestamp_advice_is_clock_sync_or_other_time_unit(clock, action):
     (finding,) = source_stamps.detect_wrong_timestamp_unit_or_clock(
         compare(simulate_flight(Scenario(passes=1))), clock
     )

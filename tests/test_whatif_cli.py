@@ -89,7 +89,7 @@ def test_ekf2_replay_rejects_removal_of_unknown_aiding_source(estimated: WhatIfA
             what_if(model, [], without)
 
 
-def test_whatif_command_without_set_proposes_no_needless_change(estimated: WhatIfAnalysis) -> None:
+def test_whatif_without_option_set_proposes_no_needless_change(estimated: WhatIfAnalysis) -> None:
     """The UWB noise is 0.10 m, as EKF2 assumes, and its timestamps are right."""
     assert estimated.uses_estimates
     assert not estimated.changes
@@ -103,7 +103,7 @@ def test_whatif_command_without_set_proposes_no_needless_change(estimated: WhatI
     assert not any("→" in line for line in lines)
 
 
-def test_whatif_command_sweep_also_applies_set_option_parameters(swept: WhatIfAnalysis) -> None:
+def test_whatif_sweep_also_applies_parameters_of_option_set(swept: WhatIfAnalysis) -> None:
     first, *values = swept.statistics.whatif
     assert dict(first.changed) == {"EKF2_EVP_GATE": 3.0}
     assert [v.changed["EKF2_EVP_NOISE"] for v in values] == pytest.approx([0.05, 0.1, 0.2])
@@ -186,7 +186,7 @@ def error(summary: Ekf2Statistics) -> float:
     return float(np.hypot(*parts))
 
 
-def test_whatif_command_omits_unpredictable_numbers(sample_flight: Flight) -> None:
+def test_whatif_omits_numbers_that_the_replay_cannot_predict(sample_flight: Flight) -> None:
     name, sweep = sample_flight.log.name, Sweep("EKF2_EVP_GATE", 1.0, 5.0, 2)
     request = WhatIfRequest(log=name, changes={"EKF2_EVP_NOISE": 0.02}, sweep=sweep)
     assert command_line(request).endswith("--set EKF2_EVP_NOISE=0.02 --sweep EKF2_EVP_GATE=1:5:2")

@@ -101,7 +101,7 @@ def drawn(analysis: Analysis) -> list:
         return list(draw_pages(analysis, None))
 
 
-def test_report_without_ekf2_replay_omits_difference_page(sample: Analysis) -> None:
+def test_report_without_ekf2_replay_omits_kf_minus_ekf2_page(sample: Analysis) -> None:
     model = sample.ekf2_model
     agreement = replace(model.agreement, good=False, reason="they part")
     doubtful = replace(
@@ -129,7 +129,7 @@ def test_report_without_ekf2_replay_omits_difference_page(sample: Analysis) -> N
     ("share", "text"),
     [
         (0.47, "decreases by 47 % of its original value."),
-        (1.4, "decreases by 140 % of its original value. Replacing other"),
+        (1.4, "decreases by 140 % of its original value. Other replacements"),
     ],
 )
 def test_kf_ekf2_difference_text_names_largest_contribution(sample, share, text) -> None:

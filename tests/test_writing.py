@@ -119,7 +119,7 @@ def test_output_to_dev_stdout_appends_to_redirected_file(desk) -> None:
         assert process.communicate()[1] == b""
     text = out.read_bytes()
     assert text.startswith(b"before\n{")
-    assert re.search(rb"Possible analysis: acceleration", text)  # the contents follow
+    assert re.search(rb"This log permits: acceleration", text)  # the contents follow
 
 
 # --- each file complete or not at all ---

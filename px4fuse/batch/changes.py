@@ -152,6 +152,7 @@ def _read_given_results(path: Path) -> InputResults | None:
 def _analyse_log(
     path: Path, input_to_copy_settings_from: InputResults | None, progress: ProgressCallback
 ) -> InputResults:
+    """Analyse a log for ``px4fuse diff``, with the settings of another input if one is given."""
     request = ComparisonRequest(log=str(path))
     if input_to_copy_settings_from is not None:
         other_results = input_to_copy_settings_from.results
@@ -194,6 +195,7 @@ def list_changes(input_a: InputResults, input_b: InputResults) -> DiffResults:
 
 
 def _describe_input(diff_input: InputResults) -> DiffInput:
+    """Return file name and kind of an input, and name, hash and px4fuse version of its results."""
     log = diff_input.results.log
     return DiffInput(
         given=diff_input.file_name,
@@ -205,6 +207,7 @@ def _describe_input(diff_input: InputResults) -> DiffInput:
 
 
 def _list_setting_changes(results_a: Results, results_b: Results) -> Iterator[SettingChange]:
+    """Yield each setting or PX4 parameter whose values in A and B differ."""
     settings_a, settings_b = (
         {label: find_value(results, path) for label, path in SETTING_PATHS_BY_LABEL.items()}
         | _collect_parameters(results)
@@ -261,7 +264,9 @@ def collect_compared_numbers(results: Results) -> dict[str, ComparedNumber]:
 def _find_matching_paths(results: Results, pattern: str) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield the field paths in the results that match a pattern with ``*`` in place of keys.
 
-    Each path is returned with the keys that replace ``*``.
+    Each path is yielded with the keys that replace ``*``: for ``tuning.*.sigma_z_m``, for example
+    ("tuning.horizontal.sigma_z_m", ("horizontal",)). A pattern without ``*`` is yielded unchanged,
+    even if the results do not contain this path.
     """
     parent, wildcard, pattern_end = pattern.partition(".*")
     if not wildcard:
@@ -355,14 +360,14 @@ def _collect_nis_and_nees(results: Results) -> dict[str, tuple[float, bool]]:
     mean_and_consistency_by_label: dict[str, tuple[float, bool]] = {}
     for axis, result in (find_value(results, "axes") or {}).items():
         for name, summary in result.filters.items():
-            label = FILTER_NAMES[name]
+            label = f"{FILTER_NAMES[name]}, {axis.replace(AISLE_AXIS, 'axis of largest motion')}"
             if isinstance(summary, FilterSummary):
-                mean_and_consistency_by_label[f"Mean NIS of {label}, {axis}"] = (
+                mean_and_consistency_by_label[f"Mean NIS of {label}"] = (
                     summary.nis_mean,
                     not is_inconsistent(summary),
                 )
             if (nees := find_value(summary, "truth.nees_position_mean")) is not None:
-                mean_and_consistency_by_label[f"Mean NEES of {label}, {axis}"] = (
+                mean_and_consistency_by_label[f"Mean NEES of {label}"] = (
                     nees,
                     MAX_SQRT_MEAN_NEES**-2 <= nees <= MAX_SQRT_MEAN_NEES**2,
                 )

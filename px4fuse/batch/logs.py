@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 #: Suffixes of logs in a folder; a single file may have any suffix
 LOG_SUFFIXES = (".ulg", ".tlog", ".bin", ".ulg.gz", ".ulg.zst")
-# One of the protocols of fsspec's file system for the files of this computer
+# One of the names (protocols) of the local file system in fsspec
 LOCAL_PROTOCOL = "local"
 
 
@@ -62,6 +62,7 @@ def find_logs(patterns: Iterable[str]) -> list[LogAddress]:
 
 
 def _find_logs_matching_pattern(pattern: str) -> list[LogAddress]:
+    """Return the logs that match a path, folder, glob or URL."""
     if not pattern:
         raise SettingsError("the name of a log is empty", "Give files, folders, globs or URLs.")
     file_system, root_path = _open_file_system(pattern)
@@ -94,16 +95,21 @@ def _find_logs_matching_pattern(pattern: str) -> list[LogAddress]:
 def _find_file_sizes(file_system: AbstractFileSystem, path: str) -> dict[str, int | None]:
     """Return the size of each log in a folder, of each file that matches a glob, or of a file."""
     if file_system.isdir(path):
-        files = file_system.find(path, detail=True)
-        files = {name: files[name] for name in files if name.lower().endswith(LOG_SUFFIXES)}
+        info_by_path = file_system.find(path, detail=True)
+        info_by_path = {
+            name: info_by_path[name] for name in info_by_path if name.lower().endswith(LOG_SUFFIXES)
+        }
     elif file_system.exists(path):
         # A path that exists, but is no regular file, such as a device or pipe, is also returned.
         # The process that reads it reports the error
         return {path: file_system.size(path) if file_system.isfile(path) else None}
     else:
-        files = file_system.glob(path, detail=True)
+        info_by_path = file_system.glob(path, detail=True)
+    # without folders: a glob may also match their names
     return {
-        name: info.get("size") for name, info in files.items() if info.get("type", "file") == "file"
+        name: info.get("size")
+        for name, info in info_by_path.items()
+        if info.get("type", "file") == "file"
     }
 
 
@@ -135,6 +141,7 @@ def local_file(address: str) -> Iterator[Path]:
 
 
 def _open_file_system(address: str) -> tuple[AbstractFileSystem, str]:
+    """Return the fsspec file system of a path or URL, and the path in this file system."""
     from fsspec.core import url_to_fs  # noqa: PLC0415 - needs the extra `batch`
 
     try:

@@ -79,7 +79,10 @@ def make_axis_rows(results: ComparisonResults) -> list[Row]:
             "source": results.source,
             "provenance": results.provenance,
         }
-        values = {name: find_value(records, path) for name, path in RESULT_PATH_BY_COLUMN.items()}
+        values = {
+            column: find_value(records, path) for column, path in RESULT_PATH_BY_COLUMN.items()
+        }
+        # values in ``row`` have priority. clean_row() removes missing values
         rows.append(clean_row(values | row))
     return rows
 
@@ -133,8 +136,8 @@ def find_first_action(card: DiagnosisCard) -> str:
     for action in actions:
         if action.commands:
             return "\n".join(action.commands)
-        # a change that is not a command, such as a repair of a sensor, comes first: return its
-        # text, not the command of a later action
+        # The action, such as the repair of a sensor, has no command. It comes before all commands,
+        # so return its text
         if action.changes_something():
             break
     return card.do_this[0] if card.do_this else ""
@@ -155,6 +158,7 @@ def replace_name_by_path(row: Row, path: str) -> Row:
 
 
 def collect_log_values(log: Log) -> Row:
+    """Return the table columns that describe the log itself, such as vehicle and date."""
     start_utc = format_utc_time(log.start_unix_s)
     return {
         name: find_value({"log": log}, path)
@@ -167,6 +171,7 @@ def collect_log_values(log: Log) -> Row:
 
 
 def make_table(rows: Iterable[Row]) -> pd.DataFrame:
+    """Make the table of all logs, with the columns and data types of COLUMN_TYPES."""
     empty_texts = dict.fromkeys(TEXT_COLUMNS, "")
     return pd.DataFrame(
         [empty_texts | clean_row(row) for row in rows], columns=list(COLUMN_TYPES)

@@ -59,6 +59,7 @@ def format_summary(batch_result: BatchResult) -> Page:
 
 
 def _make_log_row(log: LogSummary) -> tuple[Cell, ...]:
+    """Return the cells of a log: sign of the severity, name, diagnosis, and σ ratios."""
     colour = SEVERITY_COLOURS.get(log["severity"], MUTED_COLOUR)
     ratios = (log.get(f"{name}_ratio") for name in SIGMA_RATIO_LABELS)
     return (
@@ -81,16 +82,17 @@ def format_differences(results: DiffResults) -> Page:
     for text in results.worse:
         page.write_labelled_text("Worse", styled_text(text, ERROR_COLOUR))
     if not results.worse:
-        page.write("B has no error and no inconsistent filter that A does not have.")
+        page.write("B has no new finding of severity error and no new inconsistent filter.")
     for finding in results.findings:
         styled_message = styled_text(
             f"{finding.severity}: {finding.message}", SEVERITY_COLOURS[finding.severity]
         )
-        page.write_labelled_text(f"Only {finding.only_in}", styled_message)
+        page.write_labelled_text(f"Only in {finding.only_in}", styled_message)
     for setting in results.settings:
         a_text, b_text = map(_format_setting, (setting.a, setting.b))
-        page.write(f"Setting {setting.name}, A → B: {a_text} → {b_text}")
-    # the axis of largest motion, if compared, is sufficient for a summary
+        page.write(f"Changed setting: {setting.name}, A → B: {a_text} → {b_text}")
+    # Numbers of the axis of largest motion. If there are any, the numbers of the other axes are not
+    # printed: one axis is sufficient for a summary
     main_numbers = [number for number in results.numbers if f".{AISLE_AXIS}." in number.path]
     for number in results.numbers:
         if main_numbers and number not in main_numbers and number.path.startswith("axes."):
@@ -115,9 +117,10 @@ def _format_setting(value: float | str | None) -> str:
 
 
 def _format_value(value: float | None, interval: ConfidenceInterval | None, unit: str) -> str:
+    """Format a value with its unit and 95 % interval; "missing" for None."""
     if value is None:
         return "missing"
-    if unit == "share":  # a share has no interval
+    if unit == "share":  # a fraction, such as that of rejected positions, has no interval
         return f"{format_number(100.0 * value)} %"
     text = f"{format_number(value)} {unit}".rstrip()
     if interval is None:

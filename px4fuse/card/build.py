@@ -68,7 +68,7 @@ from .model import (
 from .verdicts import make_sigma_verdicts
 
 MAX_ACTIONS = 3
-# The diagnosis card states the fraction of rejected positions if it is at least this value
+# Minimum fraction of rejected positions that is stated on the diagnosis card
 MIN_REPORTED_REJECTED_FRACTION = 0.01
 # Aiding sources for which EKF2's √S is usually too large with PX4's default noises
 USUALLY_UNDERCONFIDENT_AIDS = frozenset({"baro_hgt", "mag", "gravity"})
@@ -230,6 +230,7 @@ def build_unusable_log_card(error: LogError | MissingDataError, path: Path) -> D
 
 
 def _make_headline(causes: Sequence[DiagnosedCause], sigma_verdicts: Sequence[Verdict]) -> str:
+    """Return the headline of the diagnosis card."""
     if causes:
         main_cause, *further_causes = causes
         for further_cause in further_causes:
@@ -256,6 +257,7 @@ def _make_headline(causes: Sequence[DiagnosedCause], sigma_verdicts: Sequence[Ve
 
 
 def _summarise_errors(analysis: Analysis) -> FlightErrors:
+    """Return position errors along the axis of largest motion, and EKF2's rejections and resets."""
     comparison, segment, reset_count = analysis.main, analysis.segment.whole_flight, None
     difference = comparison.difference
     if isinstance(analysis.flight.ekf2, Ekf2):
@@ -291,6 +293,7 @@ def _find_rmse_by_filter_m(result: AxisComparison) -> dict[FilterName, float]:
 
 
 def _compute_horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
+    """Return √(RMSE_north² + RMSE_east²) for each filter with errors along both axes."""
     rmse_by_axis_m = [_find_rmse_by_filter_m(result) for result in select_north_and_east(analysis)]
     return {
         name: math.hypot(*(rmse_m[name] for rmse_m in rmse_by_axis_m))
@@ -359,9 +362,7 @@ def _describe_worst_axis(analysis: Analysis) -> list[str]:
     """
 
     def compute_error_to_sigma_ratio(result: AxisComparison) -> float:
-        # Return 0 to omit the axis if EKF2's errors against ground truth are unknown. Omit a
-        # secondary axis also if EKF2 is overconfident only because of the lag of its output
-        # predictor
+        """Return √(mean NEES) of EKF2's position along an axis; 0 if the axis is not considered."""
         truth = result.filters["ekf2"].truth
         if isinstance(truth, Unavailable) or (
             truth.has_only_lag_errors and result is not analysis.main
@@ -395,6 +396,7 @@ def _format_lengths(length_by_filter_m: Mapping[FilterName, float]) -> str:
 
 
 def _format_actions(causes: Sequence[DiagnosedCause], notes: Sequence[Note]) -> tuple[str, ...]:
+    """Return at most MAX_ACTIONS recommended actions, each as one sentence."""
     action_sentences = [
         f"Optional: {lowercase_first_letter(note.action)}"
         for note in notes
@@ -420,9 +422,10 @@ def _format_actions(causes: Sequence[DiagnosedCause], notes: Sequence[Note]) -> 
 
 
 def _format_action(action: Action) -> str:
+    """Format an action as "device or filter: commands", or as "device or filter: sentence"."""
     if action.where == "console":
-        # Example: the command is "param set EKF2_EV_DELAY 100", the sentence "EKF2_EV_DELAY 0 → 100
-        # ms". A single command already shows the parameter: of the sentence, add only "0 → 100 ms"
+        # A single command "param set EKF2_EV_DELAY 100" already names the parameter. Of the
+        # sentence "EKF2_EV_DELAY 0 → 100 ms", keep only "0 → 100 ms"
         change_text = action.sentence
         if len(action.commands) == 1:
             _, _, change_text = action.sentence.partition(" ")
@@ -458,12 +461,13 @@ def _mark_explained_verdicts(
     }
 
     def needs_no_change(verdict: Verdict) -> bool:
-        true_word = truth_verdict_word_by_filter[verdict.filter]
-        if FILTER_NAMES[verdict.filter] in filters_to_keep_unchanged or true_word == "consistent":
+        # Verdict on the same filter from its errors against ground truth
+        truth_word = truth_verdict_word_by_filter[verdict.filter]
+        if FILTER_NAMES[verdict.filter] in filters_to_keep_unchanged or truth_word == "consistent":
             return True
         # Innovations do not contain drift, so small innovations do not prove a too large σ
         has_small_innovations = (verdict.against, verdict.word) == ("source", "underconfident")
-        return may_drift and has_small_innovations and true_word != "underconfident"
+        return may_drift and has_small_innovations and truth_word != "underconfident"
 
     return tuple(
         replace(verdict, is_explained=verdict.is_fault and needs_no_change(verdict))
@@ -515,8 +519,9 @@ def _explain_verdict_differences(
 def _explain_differing_verdicts(
     analysis: Analysis, sigma_verdicts: Sequence[Verdict], causes: Sequence[DiagnosedCause]
 ) -> str:
-    # Find the filters whose position and σ both improve in a re-run without the first fault. A
-    # re-run of EKF2 is a replay (is_prediction)
+    """Return the reason why the two σ ratios of a filter differ; "" if they agree."""
+    # Filters whose position and σ both improve in a re-run without the main fault. A re-run with
+    # is_prediction is a replay of EKF2
     filters_affected_by_fault = {
         "ekf2" if rerun.is_prediction else "kf"
         for rerun in (causes[0].reruns if causes else ())
@@ -568,6 +573,7 @@ def _explain_differing_verdicts(
 
 
 def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCause]) -> str:
+    """Describe the RMS difference KF − EKF2, and the effect of the main fault on the difference."""
     if effect.difference_rms_m is None or not ranked_causes:
         return ""
     difference_text = _format_difference(effect.axis, effect.difference_rms_m)
@@ -585,7 +591,8 @@ def _describe_difference(effect: FlightErrors, ranked_causes: Sequence[RankedCau
             f"{difference_text}. The main fault affects both KF and EKF2, so the difference "
             "KF − EKF2 hardly shows this fault."
         )
-    # State the re-run of the affected filter or, if neither is affected, of any filter, KF first
+    # Report the re-run of the affected filter. If no filter is affected, report any re-run, but
+    # prefer a re-run of KF
     possible_filters = filters_affected_by_fault or {rerun.filter for rerun in reruns}
     corrected_filter: FilterName = "kf" if "kf" in possible_filters else "ekf2"
     for rerun in reruns:  # the best re-run first
@@ -607,6 +614,7 @@ def _make_notes(cause_findings: Sequence[Finding], log_name: str) -> tuple[Note,
 def _describe_analysis(
     log: LogInfo, request: ComparisonRequest, student: tuple[str, str], **texts: Any
 ) -> AnalysisDescription:
+    """Describe the log and the command of an analysis."""
     return AnalysisDescription(
         file=log.name,
         firmware=log.firmware,
@@ -631,7 +639,7 @@ def _describe_kf_settings(
         )
         origin_text = "default" if used == default else "set by the user"
         default_text = f"{default:g}"
-        # For GNSS, the default of SIGMA_Z is not a number: it is EKF2's noise parameter
+        # For GNSS, SIGMA_Z defaults to the noise parameter of EKF2, not to a constant
         if name == "sigma_z_m" and analysis.source.origin.is_gnss:
             default, default_text = None, f"from {find_aid(analysis).noise}"
             if requested is None:

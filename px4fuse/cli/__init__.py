@@ -128,7 +128,11 @@ def help_text(name: str) -> str:
 
 @click.group(
     cls=LazyCommandGroup,
-    context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
+    context_settings={
+        "help_option_names": ["-h", "--help"],
+        "max_content_width": 100,
+        "show_default": True,
+    },
 )
 @click.version_option(package_name="px4fuse")
 def cli() -> None:
@@ -139,6 +143,7 @@ def cli() -> None:
 
 
 def _make_system_error(error: MemoryError | OSError, files_sentence: str) -> Px4FuseError:
+    """Convert an error of the operating system to an error with a remedy."""
     if isinstance(error, MemoryError) or error.errno == errno.ENOMEM:
         return Px4FuseError(
             f"not enough memory; {files_sentence}",
@@ -191,6 +196,7 @@ def main() -> None:
 
 
 def _configure_libraries() -> None:
+    """Limit libraries to one thread, and avoid slow imports and warnings without effect."""
     for name, value in ONE_THREAD_ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     for name in IGNORED_ENVIRONMENT_VARIABLES:

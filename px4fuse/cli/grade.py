@@ -42,7 +42,7 @@ from .outputs import folder_progress, write_and_print_results, write_new_file
 @output_option("DIR", "Output folder.")
 @click.option("--title", help="Title of the class page.  [default: the rubric's title]")
 @input_option(
-    "--roster", "FILE.csv", "Class list with all students.  [default: the students in --key]"
+    "--roster", "FILE.csv", "Class list with all students.  [default: students in the answer key]"
 )
 @click.option(
     "--attempt",

@@ -93,6 +93,7 @@ class NumberWithUnit(click.ParamType["float | str"]):
         return f"{unit}|auto" if self.accepts_auto else unit
 
     def convert(self, value: Any, param: Any, ctx: Any) -> float | str:
+        """Convert the text of an option to a finite number, or return "auto" if allowed."""
         if self.accepts_auto and value == AUTO:
             return str(value)
         try:
@@ -148,6 +149,7 @@ max_size_option = click.option(
 
 
 def _json_option(extra_help_text: str = "") -> OptionDecorator:
+    """Make the option --json for the results of a command."""
     return click.option(
         "--json",
         "json_path",
@@ -211,12 +213,12 @@ open_option = _make_open_option("--open", "--show", "opened")
 #: Option --show of px4fuse loop. It has no alias --open, because px4fuse loop uses --open for a
 #: flight that does not return to its start
 show_option = _make_open_option("--show", "shown")
-#: Options for the student's name and id, notes and answer form
+#: Options about the student, for the report: name, id, notes and answer form
 student_options = _combine_options(
     click.option("--student", metavar="NAME", help="Name of the student for the report."),
     click.option("--id", "student_id", metavar="ID", help="Id of the student for the report."),
     input_option("--notes", "FILE.md", "Notes of the student for the report (Markdown)."),
-    input_option("--answers", "FILE.toml", "Completed answer form from px4fuse answers."),
+    input_option("--answers", "FILE.toml", "Completed answer form (file from px4fuse answers)."),
 )
 system_option = click.option(
     "--system",
@@ -373,9 +375,9 @@ def comparison_request(log: Path, option_values: dict[str, Any]) -> ComparisonRe
 
 
 def _remove_position_file(option_values: dict[str, Any]) -> PositionFile | None:
-    """Remove the values of ``position_options`` from ``option_values``; return the file."""
+    """Take the values of ``position_options`` out of a dict; return them as a ``PositionFile``."""
     option_names = OPTION_NAMES[PositionFile]
-    # click names the parameter of --position-frame position_frame
+    # click stores the value of --position-frame under the name position_frame
     fields = {
         field: option_values.pop(name[2:].replace("-", "_")) for field, name in option_names.items()
     }
@@ -419,7 +421,7 @@ def read_student(option_values: dict[str, Any], log: Path) -> Student:
     if answers and answers.log_sha256 != hashlib.sha256(read_log_bytes(log)).hexdigest():
         raise SettingsError(
             f"--answers {answers_path} was made for another log than {log.name}.",
-            f"Write the answer form of {log.name} with px4fuse answers {log.name}.",
+            f"Write the form of this log with px4fuse answers {log.name}.",
         )
     name, student_id = (replace_unencodable(text or "") for text in (name, student_id))
     if not (texts := name + student_id + notes).isascii():

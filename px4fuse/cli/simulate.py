@@ -67,6 +67,7 @@ class CommandWithFaultTable(click.Command):
     """Command whose help ends with a table of the faults that can be injected."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Add a table of the fault names, with usage, description and default value, to --help."""
         with formatter.section(
             "Injected faults for --mistake [brackets contain the default VALUE]"
         ):
@@ -219,7 +220,7 @@ def _check_options(assignment: Path | None, kind: str) -> None:
         option = parameter.opts[0]
         if assignment is not None and parameter.name not in ASSIGNMENT_OPTIONS:
             raise SettingsError(
-                f"{option} is not available with --assignment: assignment flights are random",
+                f"{option} is not available with --assignment: the flights are random",
                 f"Omit {option}.",
             )
         if assignment is None and parameter.name in ASSIGNMENT_ONLY_OPTIONS:
@@ -235,6 +236,7 @@ def _write_assignment(
     fault_count: int | None,
     with_ground_truth: bool,
 ) -> None:
+    """Simulate a flight for each student of a class list, and write logs, forms and answer key."""
     from px4fuse.classroom.assignment import assignment
     from px4fuse.classroom.assignment.random_assignment import derive_seed_from_secret
     from px4fuse.classroom.assignment.roster import read_roster

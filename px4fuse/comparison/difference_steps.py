@@ -33,9 +33,10 @@ MAX_RELATIVE_RMSE_DIFFERENCE = 0.05
 MIN_CONTRIBUTION_FRACTION = 0.05
 # The user's SIGMA_A or SIGMA_Z is wrong if it differs from its estimate by this factor or more
 MIN_SETTING_TO_ESTIMATE_RATIO = 4.0
-# KF is run with one property of EKF2 after the other (for example EKF2's delay or innovation gate).
-# A property is reported only if it changes KF's position by more than this value (m)
+# KF takes over one property of EKF2 after another (for example delay, innovation gate). A property
+# is reported only if it changes KF's position by more than this value (m)
 MIN_REPORTED_KF_POSITION_CHANGE_M = 1e-6
+RANK_TEXTS = ("Largest", "Second largest")
 # A position difference KF - EKF2 outside the replayed time is reported only above this value (m)
 MIN_DIFFERENCE_OUTSIDE_REPLAY_M = 0.5
 # A position difference KF - EKF2 outside the replayed time is reported only if it is larger by this
@@ -139,6 +140,7 @@ def _make_comparable_settings(
 def _find_difference_at_times_without_replay(
     axis_result: AxisComparison, kf_run: KfRun, spans_s: Spans
 ) -> DifferenceOutsideReplay | None:
+    """Return the largest |position difference| KF - EKF2 outside the replayed time spans."""
     if isinstance(state := axis_result.ekf2_tracks.state, Unavailable):
         return None
     position_m = state["position_m"]
@@ -154,6 +156,10 @@ def add_cause_sentences(
     explanation: DifferenceExplanation, axis_label: str, reason_by_property_name: dict[str, str]
 ) -> DifferenceExplanation:
     """Add sentences on the causes of the difference KF - EKF2, largest first.
+
+    The largest contribution is described, and the second largest if it is not small. Further
+    sentences state the unexplained fraction, the RMSE against ground truth, and a large difference
+    outside the replayed times.
 
     Parameters
     ----------
@@ -172,14 +178,16 @@ def add_cause_sentences(
             f"The following sentences explain a run of KF with the estimated noise "
             f"({settings_text})."
         )
-    first, second, *_ = sorted(
+    min_contribution_m2 = MIN_CONTRIBUTION_FRACTION * explanation.position_mean_square_m2
+    # The properties of KF whose replacement reduces the difference most
+    largest_contributions = sorted(
         explanation.steps, key=lambda replacement: -replacement.position_mean_square_m2
     )
-    causes = [("Largest", first)]
-    min_contribution_m2 = MIN_CONTRIBUTION_FRACTION * explanation.position_mean_square_m2
-    if second.position_mean_square_m2 >= min_contribution_m2:
-        causes.append(("Second largest", second))
-    for rank_text, replacement in causes:
+    for rank_text, replacement in zip(RANK_TEXTS, largest_contributions, strict=False):
+        # The largest contribution is always stated, the second largest only if it matters
+        is_small = replacement.position_mean_square_m2 < min_contribution_m2
+        if is_small and replacement is not largest_contributions[0]:
+            break
         reason = reason_by_property_name[replacement.name]
         if replacement.name == steps.REJECTION_PROPERTY_NAME:
             reason += _describe_rejections(explanation)
@@ -206,8 +214,10 @@ def add_cause_sentences(
 def _describe_replacement_effect(
     replacement: PropertyReplacement, explanation: DifferenceExplanation
 ) -> str:
+    """Describe the effect of replacing one property of KF by that of EKF2."""
     explained_fraction = replacement.position_mean_square_m2 / explanation.position_mean_square_m2
-    increase_text = " Replacing other properties of KF increases the difference."
+    # A decrease by more than 100 % is possible only if other replacements increase the difference
+    increase_text = " Other replacements increase the difference."
     return (
         f"If KF uses EKF2's {replacement.name}, KF's position changes by up to "
         f"{replacement.position_moved_m:.2f} m (at {replacement.moved_at_s:.1f} s), and the mean "
@@ -217,6 +227,7 @@ def _describe_replacement_effect(
 
 
 def _describe_rejections(explanation: DifferenceExplanation) -> str:
+    """Describe the longest series of positions that EKF2 rejected; "" if it rejected none."""
     longest_rejection = explanation.longest_rejection
     if longest_rejection is None:
         return ""
@@ -238,8 +249,8 @@ def _describe_property_differences(
         inputs.aid,
         inputs.received_positions.source,
     )
-    # The first step from KF to EKF2 replaces three inputs of KF by those of EKF2: accelerations,
-    # positions and sample times. Describe only the largest of these differences
+    # KF and EKF2 may use different accelerations, positions or sample times. Describe only the
+    # first of these differences that applies
     if kf_settings.input == "zero":
         sample_time_text = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
     elif source.name != ekf2_position_source:
@@ -258,7 +269,8 @@ def _describe_property_differences(
     )
     if isinstance(time_offset, SourceTimeOffset) and time_offset.is_determinable:
         low_offset_s, high_offset_s = time_offset.interval_s
-        # The largest offset is the smallest age
+        # Age = assumed delay - offset, so the upper limit of the offset gives the lower limit of
+        # the age
         estimated_position_age_ms, low_ms, high_ms = (
             1e3 * (source.assumed_delay_s - offset_s)
             for offset_s in (time_offset.offset_s, high_offset_s, low_offset_s)
@@ -315,6 +327,7 @@ def _describe_property_differences(
 
 
 def _describe_unexplained_fractions(explanation: DifferenceExplanation) -> str:
+    """State the RMS difference KF - EKF2, and the fraction that remains after all replacements."""
     velocity_mean_square_m2_s2 = explanation.velocity_mean_square_m2_s2
     unexplained_position_text, unexplained_velocity_text = (
         f"{100 * min(fraction, 1.0):.1f} %"
@@ -333,6 +346,7 @@ def _describe_unexplained_fractions(explanation: DifferenceExplanation) -> str:
 
 
 def _describe_rmse(explanation: DifferenceExplanation) -> list[str]:
+    """Compare the position RMSE of KF and EKF2 in a sentence; [] without ground truth."""
     kf_rmse_m, ekf2_rmse_m = (explanation.position_rmse_to_truth_m[name] for name in ("kf", "ekf2"))
     if isinstance(kf_rmse_m, Unavailable) or isinstance(ekf2_rmse_m, Unavailable):
         return []

@@ -88,8 +88,8 @@ def prepare_comparison_inputs(
     flight, source, settings, convention = _correct_convention(
         flight, source, settings, is_checked=not (keep_positions_as_sent or flight.log.is_assessed)
     )
-    # 2. Positions in EKF2's frame. The order is important: lever arm and origin need positions in
-    # NED with correct timestamps, and the axes need the final heights
+    # 2. Lever arm, origin and height of the positions. Lever arm and origin need the corrected axes
+    # and timestamps of step 1. The choice of axes in step 3 needs the final heights
     source = _subtract_lever_arm(source, flight)
     source = _shift_vision_to_ekf2_origin(source, flight)
     source = _use_barometer_height(source, flight, request.height)
@@ -180,8 +180,8 @@ def select_source_innovations(flight: Flight, track: PositionTrack) -> Flight:
         if not item.source and item not in missing_vision_innovations
     ]
     streams = dict(flight.streams)
-    # In the list of streams, the GNSS innovations are an entry with their own topics. Its other
-    # properties are those of EKF2's state
+    # The GNSS innovations are a separate stream with own topics. Its other fields are those of the
+    # stream "ekf2_state"
     if "ekf2_state" in streams and ekf2.aids:
         streams["ekf2_innovations"] = replace(streams["ekf2_state"], topics=ekf2.innovation_topics)
     missing_data = (*other_missing_data, *missing_gnss_innovations)
@@ -266,7 +266,7 @@ def _use_barometer_height(
     ekf2, barometer_heights, log_name = flight.ekf2, flight.barometer, flight.log.name
     if height_sensor and not track.origin.is_fused_as_gnss:
         raise SettingsError(
-            f"{log_name}: `height` needs GNSS as position source, not {track.name}."
+            f"{log_name}: the option `height` needs GNSS as position source, not {track.name}."
         )
     if height_sensor == "barometer" and barometer_heights is None:
         raise MissingDataError(
@@ -305,7 +305,7 @@ def _use_barometer_height(
 
 def explain_missing_source(flight: Flight) -> Unavailable:
     """Return the reason why the log has no position source, and the action for the user."""
-    # 1. Possible sources, and general action, for a ULog or for MAVLink telemetry
+    # 1. Possible position sources and remedy, for a ULog or for MAVLink telemetry
     topics = f"{', '.join(SOURCE_TRACK_NAMES)}, and EKF2 innovations of external vision"
     remedy = (
         "set SDLOG_PROFILE to 129 and send the UWB position to PX4 as VISION_POSITION_ESTIMATE, or "
@@ -324,8 +324,8 @@ def explain_missing_source(flight: Flight) -> Unavailable:
             f"use {track.name}, which EKF2 did not fuse (--position-source {track.name}), "
             f"or {remedy}"
         )
-    # If a source contains only heights, state this more precise reason instead. If GNSS has no
-    # position fix, add this reason
+    # 3. More precise reasons. A source with heights only replaces the general reason. GNSS without
+    # position fix is added to it
     reason = f"no external position in this log (possible sources: {topics})"
     for item in flight.missing:
         if item.reason == HEIGHT_ONLY_REASON:

@@ -62,8 +62,9 @@ class FilterConfiguration:
     def can_use_logged_bad_acceleration_flag(self, inputs: ReplayInputs) -> bool:
         """Return True if EKF2's logged bad-acceleration flag is valid for this configuration.
 
-        EKF2 computes the flag from vertical innovations. It is valid if the configuration uses the
-        logged decisions, or changes nothing that has an effect on vertical innovations.
+        EKF2 computes the flag from vertical innovations. The flag is valid if the configuration
+        rejects the same samples as EKF2 in the log, or changes nothing that has an effect on
+        vertical innovations.
         """
         has_logged_height_parameters = not self.disable_time_s_by_aid and all(
             value == inputs.settings[name]
@@ -73,16 +74,22 @@ class FilterConfiguration:
         return self.uses_logged_decisions or has_logged_height_parameters
 
     def compute_delays(self, inputs: ReplayInputs) -> FusionDelays:
-        """Return the delay of the position source, and the delay of the fusion horizon."""
+        """Return the delay of the position source, and the delay of the fusion horizon.
+
+        A time offset replaces the delay parameter. Otherwise, the fusion horizon depends on the
+        largest delay parameter, which sets the length of EKF2's IMU buffer.
+        """
         if self.timestamp_offset_s is not None:
-            # The measurement time is timestamp + offset. The replay later subtracts half a
-            # prediction step, as EKF2 does, so this half step is added here. With an infinite delay
-            # of the fusion horizon, each sample arrives in time
+            # The delay is timestamp minus measurement time, so it is minus the time offset. Later,
+            # the replay also subtracts half a prediction step from each timestamp, as EKF2 does.
+            # The delay is reduced by this half step, so that only the offset remains. With an
+            # infinite delay of the fusion horizon, each sample arrives in time
             return FusionDelays(-self.timestamp_offset_s - 0.5 * inputs.mean_step_s, np.inf)
         delay_s = self.settings[inputs.aid.delay] * 1e-3
         delays_ms = [self.settings.get(aid.delay, 0.0) for aid in (GNSS_POS, EV_POS)]
         if inputs.rules.is_horizon_set_by_largest_delay:
-            # The delay of another sensor may be the largest: the logged delay is the minimum
+            # The parameters contain only two delays. Another sensor may have a larger delay, so the
+            # logged delay of the fusion horizon is the lower limit of the result
             min_horizon_s = inputs.horizon_s
         else:
             # EKF2 raises EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp)
@@ -158,6 +165,11 @@ class FilterBatch:
         self.event_time_s = segment.time_s[self.event_steps]
         self.is_enabled_by_aid = {
             name: self.event_time_s
-            < np.array([one.disable_time_s_by_aid.get(name, np.inf) for one in configurations])
+            < np.array(
+                [
+                    configuration.disable_time_s_by_aid.get(name, np.inf)
+                    for configuration in configurations
+                ]
+            )
             for name in AIDS
         }

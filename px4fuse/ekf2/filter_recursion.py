@@ -143,10 +143,13 @@ def run_segment(  # noqa: PLR0912 (the order of EKF2's fusions in one place)
 ) -> SegmentRun:
     """Run several filter configurations through one part of a flight.
 
-    The loop predicts state x and covariance P to each event, and then fuses the samples in the
-    order of EKF2. x and P are changed in place (prediction, resets) or replaced (fusions).
+    The loop runs over the fusion events. A fusion event is a time at which the replay fuses sensor
+    samples; each configuration has the same number of events. The loop predicts state x and
+    covariance P to the event, and then fuses the samples of the event in the order of EKF2. x and P
+    are changed in place (prediction, resets) or replaced (fusions).
 
-    ``intervals`` contains the intervals between fusions, one item per configuration.
+    ``intervals`` contains the intervals between successive fusion events, one item per
+    configuration.
     """
     batch = FilterBatch(inputs, segment, configurations, intervals)
     bad_acceleration_flag = _make_bad_acceleration_flag(batch)
@@ -256,14 +259,15 @@ class _Prediction:
     """
 
     def __init__(self, batch: FilterBatch, bad_acceleration_flag: BadAccelerationFlag) -> None:
+        """Compute acceleration noise and bias noise for all fusion events."""
         self.batch, self.bad_acceleration_flag = batch, bad_acceleration_flag
         self.step_counts = np.diff(batch.event_steps, axis=0, prepend=0)
         self.acceleration_variance = np.tile(
             batch.parameters["EKF2_ACC_NOISE"] ** 2, (len(self.step_counts), 1)
         )
         if (clipped_fraction := batch.segment.clipped_fraction) is not None:
-            # While an accelerometer clips, EKF2 uses BAD_ACCELERATION_NOISE_M_S2. The variance of
-            # an event is the mean over its prediction steps
+            # While an accelerometer clips, EKF2 uses BAD_ACCELERATION_NOISE_M_S2. The acceleration
+            # variance between two events is the mean over the prediction steps between these events
             clipped_fraction_sums = np.cumsum(clipped_fraction)
             previous_event_steps = batch.event_steps - self.step_counts
             mean_clipped_fraction = (
@@ -278,15 +282,19 @@ class _Prediction:
     def _prepare_transitions(self, events: slice) -> None:
         """Compute Φ, u and Q of the predictions to several fusion events at once."""
         batch = self.batch
-        transitions = {one: one.compute_transitions(events) for one in set(batch.intervals)}
+        # Configurations with the same intervals share their transitions
+        transitions = {
+            intervals: intervals.compute_transitions(events) for intervals in set(batch.intervals)
+        }
         (
             self.transition,
             state_change_by_attitude_correction,
             state_change_by_acceleration,
             gyro_noise_covariance,
             self.accelerometer_noise_covariance,
-        ) = _stack_by_filter([transitions[one] for one in batch.intervals])
-        # Without attitude states, the attitude is EKF2's published attitude
+        ) = _stack_by_filter([transitions[intervals] for intervals in batch.intervals])
+        # A configuration without attitude states uses EKF2's published attitude: it needs no
+        # attitude correction, and has no gyro noise
         self.state_change = (
             state_change_by_acceleration
             + batch.estimates_attitude[:, None] * state_change_by_attitude_correction
@@ -338,9 +346,11 @@ class _Prediction:
             _limit_bias_variance(P, min_bias_variance, batch.estimates_biases)
 
     def restore_constant_bias(self, x: Array, P: Array) -> None:
-        """Undo an event for an accelerometer bias that EKF2 holds constant: prediction and fusions.
+        """Restore an accelerometer bias that EKF2 holds constant, after the fusions of an event.
 
-        EKF2 holds the bias while it flags a bad acceleration. x and P are changed in place.
+        EKF2 holds the bias while it flags a bad acceleration. Prediction and fusions have changed
+        bias and bias covariance: both get their values at the previous event again. x and P are
+        changed in place.
         """
         selected = self.is_bias_constant
         if selected.any():
@@ -389,6 +399,7 @@ class _PositionFusion:
     """
 
     def __init__(self, batch: FilterBatch, bad_acceleration_flag: BadAccelerationFlag) -> None:
+        """Collect the position measurements of all fusion events, and allocate the results."""
         inputs, parameters, events = batch.inputs, batch.parameters, batch.events
         self.has_velocity = inputs.received_positions.velocity_m_s is not None
         self.batch, self.bad_acceleration_flag = batch, bad_acceleration_flag
@@ -463,14 +474,16 @@ class _PositionFusion:
         return _update_sequentially(x, P, nu, S, R, is_component_fused)
 
     def fuse_vision_and_logged_states(self, event: int, x: Array, P: Array) -> ArrayPair:
-        """Fuse external vision, and logged states that the model does not estimate.
+        """Fuse vision positions, and use logged values of states that the model does not estimate.
 
-        Without a magnetometer, the heading is EKF2's logged heading. Without height measurements,
-        the height is EKF2's logged height. Their variances become the logged variances.
+        Vision is fused here only if it is the position source. Without a magnetometer, the heading
+        becomes EKF2's logged heading. Without height measurements, EKF2's logged height is fused.
+        The variances of both are reduced to the logged variances. Return x and P.
         """
         batch, segment = self.batch, self.batch.segment
         steps = batch.event_steps[event]
-        # Collect the logged states as state index, value and R
+        # Collect the logged states as tuples (state index, value, R), with the R that changes the
+        # variance of the state to the logged variance
         measurements = []
         is_heading_logged = segment.magnetic_field is None
         heading_error_rad = batch.estimates_attitude * segment.attitude_error_rad[steps, HEADING]
@@ -493,9 +506,8 @@ class _PositionFusion:
                 R = np.where(is_fused[event], self.measurement_variance[event, :, column], np.inf)
                 measurements.append((row, self.measured_values[event, :, column], R))
         x, P = _fuse_states(x, P, measurements)
-        # Fusion of a logged state has no effect if the variance of the state is already below the
-        # logged variance. The state is therefore set to the logged value. With a logged heading,
-        # the height is not set, because it may be the fused vision height
+        # If the variance of a state is already below its logged variance, R is infinite and the
+        # fusion has no effect. Heading or height are therefore set to the logged value
         if is_heading_logged:
             x[:, HEADING] = heading_error_rad
             P = 0.5 * (P + np.swapaxes(P, 1, 2))
@@ -520,9 +532,10 @@ class _PositionFusion:
         )
 
     def get_velocity_down_update(self, event: int) -> Array:
-        """Return ν and S of the vertical GNSS velocity in a fusion event; NaN if not fused.
+        """Return ν and S of the vertical GNSS velocity in a fusion event.
 
-        The shape is (2, filters), with one column for each filter configuration.
+        The shape is (2, filters), with one column for each filter configuration. The values are NaN
+        for configurations without a GNSS velocity in this event. A rejected velocity is included.
         """
         update = [
             values[event, :, VELOCITY_DOWN_COLUMN]
@@ -546,13 +559,15 @@ def _average_samples(batch: FilterBatch, aid: Aid, samples: SensorSamples) -> Ev
     # disabled
     mean_samples.sample_count[:] *= batch.is_enabled_by_aid[aid.name]
     if aid == MAG:
-        # R depends on the parameter of each filter. R of optical flow is logged
+        # R of the magnetometer is determined by the noise parameter of each filter configuration. R
+        # of optical flow is read from the log
         sigma_gauss = np.maximum(batch.parameters[MAG.noise], MIN_MAGNETOMETER_SIGMA_GAUSS)
         mean_samples.noise[:] = sigma_gauss**2
     return mean_samples
 
 
 def _make_bad_acceleration_flag(batch: FilterBatch) -> BadAccelerationFlag:
+    """Make the bad-acceleration flag of the filter configurations in a segment."""
     segment = batch.segment
     uses_logged_flag = [
         segment.height_samples is None
@@ -630,6 +645,7 @@ class _FusionDecisions:
     """
 
     def __init__(self, batch: FilterBatch, action: IntArray) -> None:
+        """Collect the possible actions on each sample, and the logged rejections and resets."""
         received_positions, events = batch.inputs.received_positions, batch.events
         is_aid_enabled = batch.is_enabled_by_aid[batch.inputs.aid.name]
         self.fusion_rules, self.time_s = batch.inputs.rules, batch.event_time_s
@@ -703,9 +719,9 @@ class _FusionDecisions:
     def _find_rejected(self, event: int, is_outside_gate: BoolArray) -> BoolArray:
         """Return True for each filter configuration that rejects the sample of a fusion event.
 
-        Configurations that use logged decisions reject the sample if EKF2 rejected it in the log.
-        If the decision is neither logged nor follows from the logged resets, they use the gate as
-        the other configurations.
+        A configuration that uses logged decisions rejects the sample if EKF2 rejected it in the
+        log. If the rejection is not logged, the logged resets may show that EKF2 fused the sample.
+        Without such information, and for all other configurations, the gate decides.
         """
         logged_flag = self.logged_rejected_flags[event]
         if not math.isnan(logged_flag):
@@ -729,7 +745,8 @@ class _FusionDecisions:
         Such a configuration resets the position at the next rejection.
         """
         fusion_rules = self.fusion_rules
-        # Releases that reset velocity and position together wait longer while velocity is fused
+        # PX4 releases that reset velocity and position together use twice the timeout while
+        # velocity is fused
         is_velocity_fused = now_s - self.last_velocity_s <= fusion_rules.reset_timeout_s
         factor = np.where(fusion_rules.resets_velocity & is_velocity_fused, 2.0, 1.0)
         return np.asarray(now_s - self.last_position_s > factor * fusion_rules.reset_timeout_s)
@@ -744,7 +761,7 @@ def estimate_state_correlation(inputs: ReplayInputs, segment: ReplaySegment) -> 
     if (preceding_segment := segment.preceding_segment) is None:
         correlation = _compute_steady_state_correlation(segment)
     else:
-        # Vision in addition to GNSS adds no states: it is omitted here
+        # This replay omits external vision in addition to GNSS, which adds no states
         inputs = replace(inputs, vision_positions=None)
         configuration = FilterConfiguration(inputs.settings)
         preceding_segment = replace(
@@ -789,9 +806,9 @@ def _compute_steady_state_correlation(segment: ReplaySegment) -> Array:
         (TILT_ABOUT_EAST, ACCELEROMETER_BIAS_NORTH, -GRAVITY_MAGNITUDE_M_S2),
         (TILT_ABOUT_NORTH, ACCELEROMETER_BIAS_EAST, GRAVITY_MAGNITUDE_M_S2),
     ):
-        # The two acceleration errors cancel if acceleration_per_rad · θ = b, so both contain a
-        # common part. Its variance, which is their covariance, is assumed to be the smaller of both
-        # variances
+        # The accelerations by tilt error θ and bias error b cancel if acceleration_per_rad · θ = b.
+        # In the steady state, the two accelerations therefore contain a common part. Its variance
+        # is their covariance, and is assumed to be the smaller of their variances
         common_variance = min(P[tilt, tilt] * acceleration_per_rad**2, P[bias, bias])
         P[tilt, bias] = P[bias, tilt] = common_variance / acceleration_per_rad
     return _compute_correlation(state_rotation_to_ned.T @ P @ state_rotation_to_ned)
@@ -803,6 +820,7 @@ def _get_state_variances(P: Array) -> Array:
 
 
 def _make_start_state(batch: FilterBatch, bad_acceleration_flag: BadAccelerationFlag) -> ArrayPair:
+    """Return x, shape (filters, states), and P at the start of a segment, from the logged state."""
     segment, filter_count = batch.segment, len(batch.configurations)
     x = np.tile(segment.state, (filter_count, 1))
     sigma = np.sqrt(segment.variance)
@@ -875,6 +893,7 @@ def _collect_measurements(batch: FilterBatch) -> ArrayPair:
     measured_values, measurement_variance = np.full((2, *event_steps.shape, 6), np.nan)
 
     def rotate_offset(body_to_ned: Array) -> Array:
+        """Rotate the lever arm of each filter with the matrices of all events."""
         return np.asarray((body_to_ned @ sensor_offset_m[:, :, None])[..., 0])
 
     def limit_variance(reported_variance: Array, noise_parameter: str) -> Array:

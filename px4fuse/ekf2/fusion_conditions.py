@@ -156,6 +156,7 @@ def find_unmet_condition(positions: UnfusedPositions) -> UnmetCondition:
 
 
 def _check_enabling_parameter(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
+    """Yield an unmet condition if a parameter disables fusion of the position source."""
     parameter_name, bit = positions.aid.switch, 0
     if not positions.has_enabling_parameter:
         # Before PX4 v1.14, one bit mask enables all sources: bit 0 GNSS, bit 3 vision
@@ -196,6 +197,7 @@ def is_height_only(source: PositionTrack) -> bool:
 
 
 def _check_position_frame(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
+    """Yield an unmet condition if the frame of vision positions is unknown."""
     source = positions.source
     if positions.has_enabling_parameter and (source.frame, source.name) == (
         "unknown",
@@ -211,6 +213,7 @@ def _check_position_frame(positions: UnfusedPositions) -> Iterator[UnmetConditio
 
 
 def _check_position_gap(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
+    """Yield an unmet condition if a gap of the position source ended the fusion."""
     uses_vision_stop_timeout = positions.is_vision and positions.has_enabling_parameter
     stop_timeout_s = EV_STOP_INTERVAL_S if uses_vision_stop_timeout else FUSION_STOP_TIMEOUT_S
     times_s = positions.source.samples.index.to_numpy()
@@ -233,6 +236,7 @@ def find_timestamp_action(clock_name: str) -> str:
 
 
 def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
+    """Yield the unmet conditions of the position timestamps."""
     clock_map, status = positions.source.clock_map, positions.source.status
     if clock_map and (clock := clock_map.clock) in EFFECT_BY_UNUSABLE_TIMESTAMP:
         yield UnmetCondition(
@@ -281,9 +285,8 @@ def _check_position_quality(positions: UnfusedPositions) -> Iterator[UnmetCondit
     if min_quality <= 0.0 or "quality" not in status:
         return
     quality = positions.select_samples(status)["quality"]
-    # EKF2 starts fusion only if several successive samples have the minimum quality: the sample
-    # before the fused (delayed) one, and all from there to the newest. If fewer samples were not
-    # fused, all of them must have the minimum quality
+    # To start fusion, EKF2 requires the minimum quality of successive samples: from one sample
+    # before the fused (delayed) sample to the newest sample. Their number follows from the delay
     sample_count = int(np.ceil(positions.max_sample_age_s / positions.interval_s)) + 2
     has_min_quality = (quality >= min_quality).astype(float)
     have_all_min_quality = has_min_quality.rolling(min(sample_count, max(len(quality), 1))).min()
@@ -307,6 +310,7 @@ def _check_position_quality(positions: UnfusedPositions) -> Iterator[UnmetCondit
 
 
 def _check_interval(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
+    """Yield an unmet condition if vision positions come too seldom to start fusion."""
     intervals_s = np.diff(positions.select_samples(positions.source.samples).index)
     # Reconstructed positions have the rate of the logger, not the rate of the source
     is_interval_known = (
@@ -325,6 +329,7 @@ def _check_interval(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
 
 
 def _check_alignment(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
+    """Yield an unmet condition for each missing alignment of EKF2: tilt, heading."""
     if positions.compute_status_bit_fraction("tilt_align") < 0.5:
         yield UnmetCondition(
             "alignment",
@@ -348,6 +353,7 @@ def _check_alignment(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
 
 
 def _check_gnss(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
+    """Yield the unmet conditions of GNSS: GNSS declared faulty, failed GNSS checks of EKF2."""
     if positions.compute_status_bit_fraction("gnss_fault") > MIN_GNSS_CHECK_FAILURE_FRACTION:
         yield UnmetCondition(
             "fault",
@@ -377,7 +383,7 @@ def _check_gnss(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
         limit_text = ""
         if parameter in parameters:
             limit_text = f", limit {parameter} {parameters[parameter]:g}{unit}"
-        check_texts.append(f"{name} (failed {failed_percent:.0f} % of the time{limit_text})")
+        check_texts.append(f"{name} (check failed {failed_percent:.0f} % of the time{limit_text})")
     yield UnmetCondition(
         "checks",
         f"GNSS fails EKF2's check of the {failed_checks[0][1]}",
@@ -388,6 +394,7 @@ def _check_gnss(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
 
 
 def _check_gate(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
+    """Yield an unmet condition if EKF2's gate rejects most positions."""
     aid = positions.aid
     aid_log = positions.ekf2.aids.get(aid.name)
     if aid_log is None or "rejected" not in aid_log.samples:

@@ -74,7 +74,8 @@ MOSTLY_REJECTED_FRACTION = 0.5
 # Minimum correlation of replayed and logged innovations if EKF2 rejects more than
 # MOSTLY_REJECTED_FRACTION of the positions
 MIN_INNOVATION_CORRELATION_IF_MOSTLY_REJECTED = 0.99
-# Maximum difference between the fractions of rejected positions in replay and log, if they agree
+# Maximum difference between the rejected fractions of positions in replay and log. It is tested if
+# the innovations do not correlate and many positions are rejected
 MAX_REJECTED_FRACTION_DIFFERENCE = 0.05
 # Maximum relative difference of the mean NIS in replay and log, if they agree
 MAX_RELATIVE_NIS_DIFFERENCE = 0.25
@@ -161,6 +162,7 @@ class ReplayAgreement(Record, kw_only=True):
         return {"north": self.north, "east": self.east}
 
     def report_disagreement(self, result_name: str) -> Unavailable:
+        """Return Unavailable for a result that needs an EKF2 replay that agrees with the log."""
         profile = "SDLOG_PROFILE 129 (default and vision)"
         if self.gnss_pos:
             profile = "SDLOG_PROFILE 3 (default and full rates)"
@@ -471,7 +473,7 @@ def match_updates(
     age_s = logged_times_s - fusion_times_s[np.maximum(update_rows, 0)]
     is_matched = (update_rows >= 0) & (age_s <= MAX_INNOVATION_AGE_S)
     # A log row in the same prediction step as a fusion may still contain the previous innovation.
-    # Such rows are omitted, unless most rows are written in the prediction step of the fusion
+    # Omit such rows, if more than half of the rows remain
     is_unambiguous = is_matched & (age_s >= SAME_STEP_TOLERANCE_S)
     if is_unambiguous.sum() > 0.5 * is_matched.sum():
         is_matched = is_unambiguous
@@ -484,6 +486,9 @@ def _compare_axis(
     replayed_innovations: pd.DataFrame,
     state_difference: pd.DataFrame,
 ) -> AxisAgreement:
+    """Return the agreement of replay and log along one axis."""
+    # The inner loop is over replay and log: replayed and logged innovation, then replayed and
+    # logged innovation variance
     nu, nu_logged, S, S_logged = (
         innovations[name].to_numpy()
         for name in (f"innovation_{axis}_m", f"innovation_variance_{axis}_m2")
@@ -536,12 +541,15 @@ def _judge_agreement(
     tolerance_factor: float = 1.0,
     min_allowed_correlation: float = MIN_INNOVATION_CORRELATION,
 ) -> tuple[bool, str]:
-    """Return True if the replay agrees with the log, and the statistics as a text.
+    """Return True if the replay agrees with the log, and the statistics or the reason as a text.
 
     1. The innovation variances must agree, because they hardly depend on single rejections.
-    2. If the innovations are correlated enough, the positions must agree.
-    3. If not, and few samples are rejected, the replay does not agree. With many rejections,
-       rejected fraction and mean NIS must agree: a different rejection changes later innovations.
+    2. If the correlation of the innovations is at least the minimum, the positions must agree.
+    3. If the correlation is smaller and few samples are rejected, the replay does not agree.
+    4. If the correlation is smaller and many samples are rejected, rejected fraction and mean NIS
+       must agree. One different rejection changes all later innovations.
+
+    ``tolerance_factor`` multiplies the maximum position difference.
     """
     # 1. Innovation variances
     variance_ratios = (axis.s_ratio_median for axis in axes.values())
@@ -553,7 +561,7 @@ def _judge_agreement(
             f"(limit 1 ± {MAX_INNOVATION_VARIANCE_RATIO_DEVIATION:.2f}): "
             "EKF2 fused samples that are not in the log"
         )
-    # 2. Innovations and positions
+    # 2. Correlation of the innovations (smallest of all axes), and position difference
     min_correlation = min(axis.innovation_correlation for axis in axes.values())
     correlation_text = (
         f"replayed and logged innovations have a correlation of {min_correlation:.4f}"
@@ -628,7 +636,7 @@ def judge_agreement_with_logged_rejections(
     is_in_agreement, reason = _judge_agreement(
         agreement_with_logged_rejections.axes, 0.0, 0.0, *agreement_limits
     )
-    reason = f"in a replay that rejects the same samples as EKF2, {reason}"
+    reason = f"if the EKF2 replay rejects the same samples as in the log, {reason}"
     if is_mostly_rejected and not is_in_agreement:
         reason = (
             f"{reason}. EKF2 rejected {rejected_fraction:.0%} of the positions and relied on the "

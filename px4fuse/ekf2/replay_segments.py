@@ -385,7 +385,8 @@ def find_replay_segments(
     boundary_times_s = [
         *_find_data_boundary_times_s(imu_times_s, position_times_s),
         *(_find_interruption_times_s(imu, ekf2) if is_gnss else ()),
-        # Another primary EKF2 instance has another state
+        # Times of switches to another EKF2 instance, whose state is different. The first instance
+        # is not a switch
         *(time_s for time_s, _ in ekf2.primary_instances[1:]),
         *(change.time_s for change in parameter_changes),
         magnetic_field_end_s,
@@ -408,7 +409,8 @@ def find_replay_segments(
     for part_start_s, part_end_s in pairwise(
         np.unique(np.clip(boundary_times_s, earliest_start_s, latest_end_s))
     ):
-        # 1. Earliest start: EKF2 has fused positions, flies, and has magnetic field states
+        # 1. Earliest start of the replay: EKF2 has fused positions, the vehicle has taken off and,
+        # in the part with magnetometer fusion, the magnetic field states have settled
         fusion_times_in_part_s = rows_between(innovations, part_start_s, part_end_s).index
         if not len(fusion_times_in_part_s):
             continue
@@ -532,7 +534,12 @@ def _find_interruption_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
 
 
 def _compute_clipped_fraction(imu: pd.DataFrame, time_s: Array) -> Array:
-    """Return the clipped fraction of the three accelerometer axes in each prediction step."""
+    """Return the fraction of the three accelerometer axes that clip in each prediction step.
+
+    ``time_s``, shape (n + 1,), contains the start and the ends of the n steps. Element k of the
+    result belongs to the step that ends at ``time_s[k]``. It is the maximum over the IMU samples of
+    the step, and 0 if clipping is not logged.
+    """
     clipped_fraction_by_step = np.zeros(len(time_s))
     # "clipped" has one bit per axis
     if "clipped" in imu:
@@ -589,31 +596,26 @@ def _make_segment(
         np.concatenate([[[1.0, 0.0, 0.0, 0.0]], from_rotation_vector(rotation_vectors)])
     )
 
-    def compute_rotation_from_end_attitude(
-        attitude_samples: pd.DataFrame, lead_time_s: float, end_attitude: Array
+    def compute_rotation_from_reference(
+        attitude_samples: pd.DataFrame, lead_time_s: float, reference_attitude: Array
     ) -> ArrayPair:
-        """Return the times (s) of attitude samples, and their rotation from ``end_attitude``.
-
-        ``end_attitude`` is the attitude at the start of the segment and at the end of each
-        prediction step. Samples up to ``lead_time_s`` before the start of the segment are included.
-        """
         attitude_samples = rows_between(
             attitude_samples, step_times_s[0] - lead_time_s, step_times_s[-1]
         )
         attitude_time_s = attitude_samples.index.to_numpy()
-        inverse_attitude = conjugate(interpolate(attitude_time_s, step_times_s, end_attitude))
+        inverse_attitude = conjugate(interpolate(attitude_time_s, step_times_s, reference_attitude))
         return attitude_time_s, multiply(
             attitude_samples[Columns.QUATERNION].to_numpy(), inverse_attitude
         )
 
     # Rotation (in NED) that turns the gyro's integrated attitude into EKF2's published attitude
     rotation_to_published_attitude = interpolate(
-        step_times_s, *compute_rotation_from_end_attitude(attitude, 0.0, gyro_attitude)
+        step_times_s, *compute_rotation_from_reference(attitude, 0.0, gyro_attitude)
     )
     nominal_attitude = multiply(rotation_to_published_attitude, gyro_attitude)
     # 4. Error of the nominal attitude, from the attitude in the logged states. The first state row
     # may be up to 0.1 ms before the first IMU sample
-    state_times_s, error_quaternions = compute_rotation_from_end_attitude(
+    state_times_s, error_quaternions = compute_rotation_from_reference(
         fusion_record.delayed_state, 1e-4, nominal_attitude
     )
     attitude_error_rad = to_rotation_vector(error_quaternions)
@@ -789,9 +791,9 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     # Optical flow measures the velocity along the forward and right axes, so only the first two
     # rows of the rotation to the body frame are used
     ned_to_body_rotation = segment.body_to_ned[step_index].swapaxes(2, 3)[:, :, :2]
-    # The samples i of a mean k measure the velocity at different times. The velocity change since
-    # the start of the segment, integrated from the IMU, is averaged in the same way and subtracted.
-    # All samples then measure the same velocity
+    # Flow value k is the mean of samples i, which measured the velocity at different times. The
+    # weighted mean of the IMU velocity change since the start of the segment is subtracted. The
+    # result is the velocity at the start
     imu_velocity_m_s = np.einsum(
         "ki,kiab,kib->ka", weight, ned_to_body_rotation, segment.imu_velocity_change_m_s[step_index]
     )
@@ -816,9 +818,10 @@ def compute_low_pass_weights(
 ) -> tuple[IntArray, Array]:
     """Return the samples in each of m low-pass filtered values, and their weights.
 
-    Each sample is given by its prediction step. Both arrays have the shape (m, k) for up to k
-    samples per value, newest sample first. The weights are those of a first-order low-pass filter,
-    and their sum is 1 in each value. The weight is 0 after the last sample of a value.
+    The first array contains the prediction step of each sample. Both arrays have the shape (m, k)
+    for up to k samples per value, newest sample first. The weights are those of a first-order
+    low-pass filter, and their sum is 1 in each value. A value with fewer than k samples is padded
+    with the weight 0.
 
     Parameters
     ----------
@@ -925,8 +928,8 @@ def find_step_ends(
     ):
         accumulated_count += sample_count
         accumulated_time_s += interval
-        # A step ends after a number of samples in more than half the configured time, after the
-        # configured time, or where the log contains a state (imu_down_sampler.cpp)
+        # A step ends if it has enough samples and more than half of the configured length. It also
+        # ends after the configured length, and at a logged state (imu_down_sampler.cpp)
         if (
             (accumulated_count >= samples_per_step and accumulated_time_s > 0.5 * configured_step_s)
             or accumulated_time_s > configured_step_s

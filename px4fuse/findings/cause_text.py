@@ -108,6 +108,7 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
 
 
 def _list_actions(analysis: Analysis, change: Mapping[str, float]) -> Iterator[str]:
+    """Yield one sentence on the user's action for each changed setting or data of a re-run."""
     if change.get(rerun_effects.OUTLIERS_KEY):
         yield find_source_texts(analysis).outlier_action
     if rerun_effects.FORWARD_BIAS_KEY in change:
@@ -157,6 +158,7 @@ def format_kf_settings(settings: Mapping[str, float]) -> str:
 
 
 def _format_one_change(analysis: Analysis, cause: Rerun, name: str) -> str:
+    """Format one change of a re-run, for example "12 outliers removed"."""
     value, settings = cause.change[name], analysis.settings
     match name:
         case rerun_effects.OUTLIERS_KEY:
@@ -175,7 +177,7 @@ def _format_one_change(analysis: Analysis, cause: Rerun, name: str) -> str:
             is_drifting = isinstance(analysis.heading, HeadingError) and analysis.heading.drifts
             angle_text = f"{value:+.0f}°{' on average' if is_drifting else ''}"
             return (
-                f"EKF2's heading corrected (error {angle_text})"
+                f"heading error of EKF2 removed ({angle_text})"
                 if analysis.source.origin.is_gnss
                 else f"positions rotated in yaw by {angle_text}"
             )

@@ -159,6 +159,7 @@ def _make_setting_finding(
     noise: NoiseEstimate,
     deviation: SettingDeviation,
 ) -> Finding:
+    """Make the finding on a KF noise setting (``name``) that is too small or too large."""
     estimated_noise, factor, severity = deviation
     setting, label = getattr(analysis.settings, name), SETTING_RANGES[name].label
     is_too_small = setting < estimated_noise
@@ -167,7 +168,7 @@ def _make_setting_finding(
     if is_gain_too_large:
         effect, gain_size_word = "KF follows the noise of single positions", "large"
     else:
-        effect, gain_size_word = "KF follows the positions slowly", "small"
+        effect, gain_size_word = "KF lags behind the positions", "small"
     size_word = "small" if is_too_small else "large"
     action = format_setting_action(analysis, name)
     return finding(
@@ -187,6 +188,7 @@ def _make_setting_finding(
 
 
 def format_estimate(name: str, setting: float, noise: NoiseEstimate) -> str:
+    """Format a noise setting with its maximum-likelihood estimate and 95 % interval."""
     unit, label = SETTING_RANGES[name][2:]
     value = f"at most {noise.high:.3g}" if noise.value is None else f"{noise.value:.3g}"
     value += f" {unit}"
@@ -283,6 +285,7 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
 
 
 def detect_inconsistent_variances(analysis: Analysis) -> Findings:
+    """Detect an under- or overconfident KF or EKF2, separately for horizontal and vertical axes."""
     for filter_name, is_underconfident in product(FILTER_NAMES, (True, False)):
         # id of the finding on the horizontal axes, which is the cause of the finding on the
         # vertical axis
@@ -306,6 +309,7 @@ def _make_wrong_sigma_finding(
     filter_name: FilterName,
     inconsistent_axes: list[tuple[AxisComparison, FilterSummary]],
 ) -> Finding:
+    """Make the finding on the most inconsistent of several axes; the main axis has priority."""
     worst_axis, summary = max(
         inconsistent_axes,
         key=lambda axis: (axis[0] is analysis.main, abs(np.log(axis[1].nis_mean))),
@@ -314,7 +318,7 @@ def _make_wrong_sigma_finding(
     if _has_default_noises(analysis, filter_name, worst_axis):
         severity = lower_severity(severity)
     cause, remedy_text, is_note = _explain_wrong_sigma(analysis, filter_name, worst_axis, summary)
-    low, high = summary.nis_band
+    low, high = summary.nis_band  # 95 % interval of the mean NIS of a consistent filter
     size_word = "large" if summary.sigma_ratio < 1.0 else "small"
     return finding(
         "note" if is_note else severity,
@@ -336,7 +340,11 @@ def _make_wrong_sigma_finding(
 def _explain_wrong_sigma(
     analysis: Analysis, filter_name: FilterName, result: AxisComparison, summary: FilterSummary
 ) -> tuple[str, str, bool]:
-    """Return cause and remedy of a wrong σ, and True if it is no fault (severity note)."""
+    """Return cause and remedy of a wrong σ, and True if the wrong σ is no fault (severity note).
+
+    An underconfident filter may need its large σ, because innovations do not show slow errors.
+    These cases are tested first. Otherwise the re-run that corrects the mean NIS shows the cause.
+    """
     source, is_ekf2 = analysis.source, filter_name == "ekf2"
     is_underconfident = summary.sigma_ratio < 1.0
     # 1. Too small innovations do not prove a fault: slow errors, which only ground truth shows, may
@@ -359,8 +367,7 @@ def _explain_wrong_sigma(
         return UNKNOWN_CAUSE, action, True
     if is_underconfident and any(name == filter_name for name, *_ in find_hidden_errors(analysis)):
         return UNKNOWN_CAUSE, KEEP_NOISE_BECAUSE_OF_TRUTH_ACTION, False
-    # 3. Find the cause by re-runs. An underconfident filter is no fault if ground truth requires
-    # its σ. A large SIGMA_Z of GNSS is no fault either, because px4fuse takes it from EKF2
+    # Find the cause by re-runs
     rerun = find_cause_rerun(analysis.reruns, filter_name, result.axis.name)
     action = _find_action_for_wrong_sigma(analysis, filter_name, result, rerun)
     is_kf_noise_from_ekf2 = is_underconfident and not is_ekf2 and source.origin.is_gnss
@@ -373,6 +380,7 @@ def _find_reported_noise_m(analysis: Analysis) -> float:
 
 
 def _format_action_for_excessive_noise(analysis: Analysis) -> str:
+    """Return the action for an EKF2 noise parameter above reported and estimated noise; else ""."""
     name = find_aid(analysis).noise
     noise_setting_m = analysis.flight.log.parameters.get(name, np.nan)
     reported_noise_m = _find_reported_noise_m(analysis)
@@ -442,6 +450,7 @@ def _find_action_for_wrong_sigma(
     result: AxisComparison,
     cause: Rerun | None,
 ) -> str:
+    """Return the action for a wrong σ of a filter along an axis."""
     if cause is not None and not rerun_refutes_cause(analysis, filter_name, cause):
         return format_action(analysis, cause.change)
     reruns = find_reruns(analysis.reruns, filter_name, result.axis.name)
@@ -458,7 +467,10 @@ def _find_action_for_wrong_sigma(
 def _find_sigma_action_without_replay(
     analysis: Analysis, result: AxisComparison, axis_tuning: AxisTuning
 ) -> str:
-    """Return the change of EKF2's noise to its estimate, if EKF2 cannot be replayed."""
+    """Return the change of EKF2's noise to its estimate, if EKF2 cannot be replayed.
+
+    If the estimate is unknown or does not explain the wrong σ, the text names other checks.
+    """
     aid, ekf2_summary = find_aid(analysis, result.axis.name), result.filters["ekf2"]
     assert not isinstance(ekf2_summary, Unavailable)
     estimated_noise_m = axis_tuning.sigma_z.value_or_bound(0.0)

@@ -24,6 +24,7 @@ CHECK_RECEIVER_ACTION = f"Check the delay of the GNSS receiver ({GNSS_POS.delay}
 
 
 def detect(analysis: Analysis) -> Findings:
+    """Yield the findings on the time offset of the positions, and on EKF2's delay parameters."""
     time_offset = analysis.time_offset
     if (
         isinstance(time_offset, SourceTimeOffset)
@@ -36,6 +37,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_time_offset(analysis: Analysis, time_offset: SourceTimeOffset) -> Findings:
+    """Detect a time offset of the position timestamps, or its change in flight."""
     if find_low_pass(analysis) is not None:  # a low-pass filter delays positions, not timestamps
         return
     low_s, high_s = time_offset.interval_s
@@ -113,6 +115,7 @@ def _find_receiver_delay_parameter(analysis: Analysis) -> str | None:
 
 
 def _format_assumed_delay(analysis: Analysis, time_offset: SourceTimeOffset) -> str:
+    """Format the logged and the estimated delay of the GNSS receiver; "" for other sources."""
     delay_parameter = _find_receiver_delay_parameter(analysis)
     if delay_parameter is None:
         return ""
@@ -181,8 +184,10 @@ def detect_wrong_delay(analysis: Analysis, time_offset: SourceTimeOffset) -> Fin
             "sigma_ms": 1e3 * time_offset.sigma_s,
         }
     limit_sentence = ""
-    if limit_text := remedy.describe_delay_limit(parameter, estimated_delay_ms, delay_ms):
-        limit_sentence = f" The parameter {parameter} cannot {limit_text}."
+    if exceed_limit_or_be_negative := remedy.describe_delay_limit(
+        parameter, estimated_delay_ms, delay_ms
+    ):
+        limit_sentence = f" The parameter {parameter} cannot {exceed_limit_or_be_negative}."
     else:
         action = _find_delay_remedy(analysis, parameter, action)
     yield make_warning(
@@ -215,6 +220,11 @@ def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
 
 
 def _find_delay_remedy(analysis: Analysis, parameter: str, action_if_not_confirmed: str) -> str:
+    """Return the action for a wrong delay parameter: the change of a re-run that reduces the error.
+
+    The error is the position RMSE or, without ground truth, the mean NIS. If the re-run does not
+    reduce the error, return ``action_if_not_confirmed``. Without a re-run, the action is a check.
+    """
     rerun = _find_rerun(analysis, "ekf2", "delay")
     if rerun is None:
         return f"Check {parameter}."

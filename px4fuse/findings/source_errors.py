@@ -1,8 +1,8 @@
 """Errors of the positions that a constant white noise does not describe.
 
-Repeated positions, time-correlated, unequal and varying noise, jitter; with ground truth also
-periodic errors, a varying time offset and a scale factor error. An IMU oscillation and a late
-attitude are detected too, because their errors resemble those of the positions.
+Repeated positions, time-correlated noise, noise that differs between axes or varies, and jitter.
+With ground truth also periodic errors, a varying time offset and a scale factor error. An IMU
+oscillation and a late attitude are detected too, because their effects resemble position errors.
 """
 
 from dataclasses import asdict
@@ -82,6 +82,7 @@ MIN_SEVERE_PERIODIC_ERROR_M = 0.2
 
 
 def detect(analysis: Analysis) -> Findings:
+    """Yield the findings on position errors that a constant white noise does not describe."""
     yield from detect_noise_faults(analysis)
     yield from detect_attitude_delay(analysis)
     yield from detect_imu_oscillation(analysis)
@@ -101,6 +102,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_noise_faults(analysis: Analysis) -> Findings:
+    """Yield the findings on repeated positions and noise, except for reconstructed positions."""
     if analysis.source.origin.reconstructed:
         return
     yield from detect_repeated_positions(analysis)
@@ -111,6 +113,7 @@ def detect_noise_faults(analysis: Analysis) -> Findings:
 
 
 def detect_time_correlated_noise(analysis: Analysis) -> Findings:
+    """Detect position noise that is correlated in time, unless a low-pass filter explains it."""
     noise = analysis.time_correlated_noise
     if (
         not isinstance(noise, TimeCorrelatedNoise)
@@ -149,6 +152,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
 
 
 def _has_error_above_reported_sigma(analysis: Analysis) -> bool:
+    """Return True if errors against ground truth exceed the σ of KF or EKF2 along the main axis."""
     return any(
         isinstance(errors := summary.truth, ErrorsAgainstTruth)
         and not errors.has_only_lag_errors
@@ -210,14 +214,15 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
     yield make_warning(
         "source_noise_unequal_axes",
         f"{analysis.source.kind_name} noise is {noisy_sigma_m:.2g} m along {noisy_axis} and "
-        f"{quiet_sigma_m:.2g} m along {quiet_axis}. One measurement noise (SIGMA_Z, EKF2) does not "
-        "fit both axes.",
+        f"{quiet_sigma_m:.2g} m along {quiet_axis}. One measurement noise (SIGMA_Z of KF, R of "
+        "EKF2) does not fit both axes.",
         action,
         evidence,
     )
 
 
 def detect_noise_variation(analysis: Analysis) -> Findings:
+    """Detect that the position noise is larger in one part of the flight than in the rest."""
     noisy_flight_part = analysis.noisy_flight_part
     if (
         noisy_flight_part is None
@@ -243,6 +248,7 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
 
 
 def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResiduals) -> Findings:
+    """Detect timestamp jitter, and position noise that grows with speed."""
     jitter_s, clock_map = find_timestamp_jitter(local_residuals), analysis.source.clock_map
     if jitter_s is not None and (clock_map is None or clock_map.distinct_stamps is None):
         yield finding(
@@ -271,6 +277,7 @@ def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResi
 
 
 def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: ErrorFit) -> Findings:
+    """Detect a periodic position error or, without it, a time offset that varies in flight."""
     periodic_error = find_periodic_error(error_fit)
     positions_text = analysis.source.positions_text
     if periodic_error is not None:
@@ -304,6 +311,7 @@ def detect_periodic_errors_and_offset_changes(analysis: Analysis, error_fit: Err
 
 
 def detect_scale_error(analysis: Analysis, error_fit: ErrorFit) -> Findings:
+    """Detect a significant scale factor error of the positions against ground truth."""
     if abs(error_fit.scale) >= max(
         MIN_SCALE_ERROR_AGAINST_TRUTH, MIN_SCALE_ERROR_TO_SIGMA_RATIO * error_fit.scale_error_sigma
     ):
@@ -334,6 +342,7 @@ def detect_imu_oscillation(analysis: Analysis) -> Findings:
 
 
 def detect_attitude_delay(analysis: Analysis) -> Findings:
+    """Detect a time offset between the logged attitude and the gyroscopes."""
     imu, attitude = analysis.flight.imu, analysis.flight.attitude
     if not isinstance(imu, pd.DataFrame) or not isinstance(attitude, pd.DataFrame):
         return

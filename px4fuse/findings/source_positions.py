@@ -134,6 +134,7 @@ MIN_VARIANCE_ERROR_FACTOR_FOR_SEVERITY_ERROR = 3.0
 
 
 def detect(analysis: Analysis) -> Findings:
+    """Yield the findings on position values, scale, reported variance and too little motion."""
     yield from detect_constant_coordinates(analysis)
     if is_height_only(analysis.source):
         return
@@ -188,6 +189,7 @@ def _find_valid_time_offset(analysis: Analysis) -> SourceTimeOffset | None:
 
 
 def detect_low_pass(analysis: Analysis) -> Findings:
+    """Detect positions that the source low-pass filters, so that they lag."""
     low_pass = find_low_pass(analysis)
     if low_pass is not None:
         yield finding(
@@ -237,10 +239,9 @@ def detect_jumps(analysis: Analysis) -> Findings:
         error_if(size_m >= MIN_JUMP_FOR_SEVERITY_ERROR_M),
         "source_position_jump",
         f"{analysis.source.positions_text} {jump_text} at {time_s:.1f} s and "
-        f"{'return afterwards' if is_jump_sum_small else 'stay there'}. The IMU does not "
-        "measure this motion "
-        f"(± {1.96 * sigma_m:.2f} m, 95 %). {cause} KF and EKF2 follow the jump with consistent "
-        "innovations.",
+        f"{'return afterwards' if is_jump_sum_small else 'stay there'}. The IMU shows no "
+        f"such motion (95 % uncertainty ± {1.96 * sigma_m:.2f} m). {cause} KF and EKF2 follow the "
+        "jump with consistent innovations.",
         f"{source_texts.jump_action} Analyse only the time before or after the jump (--start, "
         "--end).",
         evidence,
@@ -249,14 +250,18 @@ def detect_jumps(analysis: Analysis) -> Findings:
 
 
 def detect_constant_coordinates(analysis: Analysis) -> Findings:
-    """Detect coordinates that the source does not measure: they are constant in the whole log."""
+    """Detect coordinates that the source does not measure: they are constant in the whole log.
+
+    A single constant coordinate is reported, or at least x and y (source of the height only). The
+    action is the value of EKF2_EV_CTRL with which EKF2 fuses no constant coordinate.
+    """
     source, parameters = analysis.source, analysis.flight.log.parameters
     coordinates = find_constant_coordinates(source)
     is_single_coordinate = len(coordinates) == 1
     if not (is_single_coordinate or is_height_only(source)) or (
         is_single_coordinate and source.quantisation_step_m > 0.0
     ):
-        return  # rounded positions may be constant in motion
+        return  # rounded positions may be constant although the vehicle moves
     median_m_by_coordinate = dict(
         zip("xyz", source.samples[Columns.POSITION].median().tolist(), strict=True)
     )
@@ -504,6 +509,7 @@ def compute_outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[
 
 
 def _format_rejected_outliers(analysis: Analysis, outlier_time_s: Array) -> str:
+    """Format the number of outliers that EKF2's gate rejected; "" if the log does not show it."""
     innovations = analysis.main.ekf2_tracks.innovations
     position_count = len(analysis.main.axis.measurement_time_s)
     if (
@@ -538,8 +544,8 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
     error_factor = max(variance_ratio, 1.0 / variance_ratio)
     if error_factor < MIN_VARIANCE_ERROR_FACTOR or low <= reported_sigma_m <= high:
         return
-    # Time-correlated errors may be a reason for a reported σ above the estimated noise, which does
-    # not contain them. The errors against ground truth contain them, so compare σ with these errors
+    # A large reported σ may be correct: it may include time-correlated errors, which the noise
+    # estimate does not contain. So also compare a large σ with the errors against ground truth
     size_word, correlation_note = "small", ""
     if variance_ratio > 1.0:
         size_word, rmse_m = "large", _compute_rmse_per_axis_m(analysis)

@@ -96,6 +96,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_invalid_positions(analysis: Analysis) -> Findings:
+    """Detect positions that are zero, repeated, far away, NaN or measured without a fix."""
     source, segment = analysis.source, analysis.segment
     invalid_reasons = source.invalid_reasons[segment.start_s : segment.end_s]
     for reason, (name, fault, action) in INVALID_POSITION_TEXTS.items():
@@ -264,6 +265,7 @@ def _describe_replayed_effect(
 
 
 def _compute_horizontal_rmse_m(replay: Ekf2Replay, truth: Truth) -> float:
+    """Return the horizontal position RMSE (m) of an EKF2 replay against ground truth."""
     track = rows_inside(replay.published_state, replay.find_evaluated_spans())
     errors_m = (
         track[name] - np.interp(track.index, truth.samples.index, truth.samples[name])
@@ -288,8 +290,8 @@ def detect_two_senders(analysis: Analysis) -> Findings:
         window_count, WINDOW_SAMPLES, -1
     )
     window_medians_m = np.median(deviation_windows_m, axis=1)
-    # A lost sample exchanges the senders, so the medians of all later windows have the opposite
-    # sign. Invert the medians that point away from the largest median
+    # After a lost sample, even and odd samples change roles, so later medians change sign. Invert
+    # the medians that point away from the largest median
     largest_median_deviation_m = window_medians_m[
         np.argmax(np.linalg.norm(window_medians_m, axis=1))
     ]
@@ -362,8 +364,9 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
     is_attitude_copied = orientation is not None and orientation.verdict == "copied"
     yield make_error(
         "source_is_ekf2_estimate",
-        f"{source.kind_name} sends EKF2's own position{' and attitude' * is_attitude_copied} "
-        f"back. The positions equal those that EKF2 estimated {1e3 * delay_s:.0f} ms before "
+        f"{source.kind_name} sends EKF2's own position"
+        f"{' and attitude' if is_attitude_copied else ''} back. "
+        f"The positions equal those that EKF2 estimated {1e3 * delay_s:.0f} ms before "
         f"(median difference {1e3 * distance_m:.1f} mm). These copies are not measurements.",
         "Send the position of the positioning system. Do not connect the autopilot's local "
         "position (MAVROS local_position) to its vision input.",

@@ -66,10 +66,7 @@ class SourceOrigin(Record):
 
     @property
     def has_all_samples(self) -> bool:
-        """True if the positions are from a file or from the messages that were received.
-
-        Positions in EKF2's logged data are only a part of them.
-        """
+        """True for a file or received messages; EKF2's logged data contain only some positions."""
         return self.route in ("given file", "as received")
 
     @property
@@ -115,7 +112,7 @@ def find_source_origin(kind: str, route: str) -> SourceOrigin:
     for origin in SOURCE_ORIGINS:
         if (origin.kind, origin.route) == (kind, route):
             return origin
-    raise ValueError(f"no position source of kind {kind!r} has the route {route!r}")
+    raise ValueError(f"unknown position source: kind {kind!r}, route {route!r}")
 
 
 REPEATED_TIMESTAMPS_NOTE = (
@@ -177,9 +174,9 @@ class ClockConversion(Record):
     pairs: Count
     # Boot clock minus this clock, at the middle of the timestamps
     offset_s: float
-    # Rate of the boot clock minus rate of this clock
+    # Drift (ppm) of the boot clock relative to the converted clock
     drift_ppm: float
-    # Robust standard deviation of the simultaneous readings from the line fitted to them
+    # Robust σ (s) of the residuals of the linear fit to simultaneous readings of both clocks
     jitter_s: NonNegativeFloat
     # Limitation of the clock conversion, if any
     note: str = ""
@@ -521,7 +518,7 @@ FULL_IMU_RATE_ACTION = (
 )
 HORIZON_NOT_LOGGED = Unavailable(
     "time of the fusion horizon",
-    "the log contains only publication times of the EKF2 state, no fusion times",
+    "the log contains no usable timestamp_sample of the EKF2 state",
     "Record a ULog with PX4 v1.13 or newer.",
 )
 

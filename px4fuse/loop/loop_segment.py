@@ -136,7 +136,7 @@ def assume_landing_at_takeoff(path: Trajectory) -> TrueFinalPose:
         sigma_m=0.10,
         sigma_heading_deg=5.0 if is_same_heading else None,
         source="assumption: the vehicle landed at the take-off place"
-        f"{' with the initial heading' * is_same_heading}",
+        f"{' with the initial heading' if is_same_heading else ''}",
         assumed=True,
     )
 

@@ -239,6 +239,7 @@ def _describe_unusual_clock(topics: Topics, topic: str) -> ClockConversion | Non
 
 
 def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable:
+    """Read the track of a position source that has its own topic."""
     layout = topics.find_layout(*find_track_layouts(name))
     if layout is None:
         return unavailable_source(name)
@@ -290,6 +291,7 @@ def _describe_timestamp_clock(published_us: IntArray, sample_timestamps_us: IntA
 
 
 def _read_fused_observation(topics: Topics, is_odometry: bool) -> PositionTrack | Unavailable:
+    """Read the positions of external vision as EKF2 used them, from estimator_aid_src_ev_pos."""
     horizontal = TOPIC_LAYOUTS["estimator_aid_src_ev_pos"]
     vertical = TOPIC_LAYOUTS["estimator_aid_src_ev_hgt"]
     topic_names = tuple(
@@ -325,7 +327,8 @@ def _make_track_from_ekf2_topics(
     """
     notes: tuple[str, ...] = ()
     if len(height_samples):
-        # Before the first EKF2 state, position and height are NaN: such a height is not missing
+        # The column _found marks positions with a height within the tolerance. Heights before the
+        # first EKF2 state are NaN, but count as found
         samples = join_nearest_samples(
             samples, height_samples.assign(_found=True), MAX_TIME_FROM_POSITION_TO_HEIGHT_S
         )
@@ -379,8 +382,8 @@ def _reconstruct_track(
         ("vehicle_local_position", *ekf2.innovation_topics),
         is_odometry=is_odometry,
         clock=(
-            f"autopilot boot clock: position timestamps are fusion times plus {EV_POS.delay}, late "
-            "by up to one sample interval"
+            f"autopilot boot clock: timestamps are fusion times plus {EV_POS.delay}; the "
+            "timestamps may be late by up to one sample interval"
         ),
     )
 
@@ -491,7 +494,8 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         # EKF2's topics lack some fields of a fix: copy these fields from the previous fix
         fixes = fixes.assign(altitude_m=fixes["altitude_m"].interpolate("index")).ffill()
     samples = convert_gnss_fixes(fixes, _find_local_origin(topics))
-    # 3. If EKF2's topics contain none of the missing fixes, compute them from EKF2's innovations
+    # If the logger dropped fixes that EKF2's topics do not contain, compute them from EKF2's
+    # innovations
     rate_hz = compute_sample_rate_hz(samples)
     notes, is_downsampled = list[str](), rate_hz < MAX_DOWNSAMPLED_HZ
     if is_downsampled:

@@ -36,7 +36,7 @@ CARD_WIDTH = 100  # characters per line
 # Width (characters) of the axis of σ ratios (actual σ ÷ reported σ), without its ends
 SIGMA_RATIO_AXIS_WIDTH = 33
 SIGMA_RATIO_AXIS_INDENT = 57  # characters left of the axis of σ ratios
-TEXT_INDENT = 11  # width (characters) of the column with the labels of texts
+TEXT_INDENT = 11  # width (characters) of the column with labels, such as "effect"
 # Ticks with labels on the axis of σ ratios
 LABELLED_RATIO_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
 SYMBOL_BY_REFERENCE = {"source": "●", "truth": "◆"}
@@ -87,11 +87,13 @@ class Paragraph(NamedTuple):
 
     Attributes
     ----------
+    first_indent : str
+        Indent or label before the first line.
     wrap_indent : str or None
-        Indent of further lines and sentences. None if the paragraph is always one line, such as a
-        command or a blank line.
+        Indent of all following lines; each sentence begins on a new line. None if the paragraph is
+        always one line, such as a command or a blank line.
     plot : str
-        Plot on the right, omitted on a narrow terminal.
+        Axis drawn with characters, to the right of the text. It is omitted on a narrow terminal.
     """
 
     text: str
@@ -121,6 +123,10 @@ class Paragraph(NamedTuple):
 
 
 def format_card_lines(card: DiagnosisCard) -> Iterator[Paragraph]:
+    """Yield the paragraphs of a diagnosis card (faults, causes and actions) for the terminal.
+
+    The card of a refused analysis contains only the error and its facts.
+    """
     if card.severity == "refused":
         yield Paragraph(f"error[{card.id}]: {card.headline}", style=SEVERITY_STYLES["error"])
         for label, text in card.facts.items():
@@ -267,6 +273,7 @@ def _map_ratio_to_character_column(ratio: float) -> int:
 
 
 def _format_identity_lines(card: DiagnosisCard) -> Iterator[Paragraph]:
+    """Yield lines on file, flight and student, then KF settings and changed options."""
     identity = card.identity
     student_text = ", ".join(filter(None, (identity.student, identity.student_id)))
     texts = (identity.file, ", ".join(list_flight_texts(card)), student_text)
@@ -294,8 +301,9 @@ def make_headline(card: DiagnosisCard) -> Paragraph:
 
 
 def _format_cause_lines(cause: DiagnosedCause, do_this: str) -> Iterator[Paragraph]:
+    """Yield lines on a cause: times, actions, re-runs and closing sentence."""
     is_shortened = len(cause.spans_s) > MAX_LISTED_SPANS
-    times_text = " (all times are in spans_s of the JSON results)" * is_shortened
+    times_text = " (spans_s in the JSON results lists all times)" * is_shortened
     yield _make_labelled_paragraph("when", format_spans(cause.spans_s) + times_text)
     # ``do_this`` is already printed above the causes. Omit an action if ``do_this`` contains its
     # sentence, unless the action is an alternative (": " in the label) or has commands. The first
@@ -324,6 +332,7 @@ def label_alternatives(cause: DiagnosedCause) -> list[tuple[str, Action]]:
 
 
 def _format_action_lines(label: str, label_width: int, action: Action) -> Iterator[Paragraph]:
+    """Yield the sentence of an action beside its label, then one line for each command."""
     indent, label_text = " " * (2 + label_width), f"  {label:{label_width}}"
     place_text = PLACE_TEXTS[action.where]
     if action.sentence:
@@ -337,9 +346,10 @@ def _format_action_lines(label: str, label_width: int, action: Action) -> Iterat
 
 
 def _format_rerun_lines(reruns: Sequence[CardRerun]) -> Iterator[Paragraph]:
+    """Yield a line for each re-run (label, result, then values with their headings), and a note."""
     headings, *rows = make_rerun_rows(reruns) or [[]]
     for label, *values, result in rows:
-        # the last heading is that of result
+        # The headings also contain "result" at the end, which has no value here: zip ignores it
         named_values = zip(headings[1:], values, strict=False)
         texts = [f"{heading.lstrip('●◆ ')} {value}" for heading, value in named_values if value]
         values_text = capitalise_first_letter(", ".join(texts))
@@ -358,7 +368,7 @@ def make_rerun_rows(reruns: Sequence[CardRerun]) -> list[list[str]]:
             "rejected": _format_before_after(
                 rerun.rejected_fraction, lambda fraction: f"{100.0 * fraction:.0f}", " %"
             ),
-            "result": f"improves {rerun.improves.removesuffix(' only')}"
+            "result": f"improves {rerun.improves.removesuffix(' only')}".replace("σ", "σ ratio")
             if rerun.improves != "nothing"
             else "no improvement",
         }
@@ -371,14 +381,15 @@ def make_rerun_rows(reruns: Sequence[CardRerun]) -> list[list[str]]:
 
 
 def format_rerun_note(reruns: Sequence[CardRerun]) -> str:
+    """Return a note on the replays of EKF2 among the re-runs, or "" without a replay."""
     replay_starts_s = [
         rerun.from_s for rerun in reruns if rerun.is_prediction and rerun.from_s is not None
     ]
     if not replay_starts_s:
         return ""
     return (
-        "EKF2 (replay): predictions by px4fuse's model of EKF2, without gaps in the positions and "
-        f"the first {min(replay_starts_s):.0f} s."
+        "EKF2 (replay): predictions by px4fuse's model of EKF2. They exclude gaps in the positions "
+        f"and the first {min(replay_starts_s):.0f} s."
     )
 
 
@@ -387,10 +398,12 @@ def _format_before_after(
     format_value: Callable[[float], str],
     unit: str = "",
 ) -> str:
+    """Format a pair of values as "before → after" with a unit; "" without values."""
     return " → ".join(map(format_value, values)) + unit if values else ""
 
 
 def _format_verdict_lines(card: DiagnosisCard) -> Iterator[Paragraph]:
+    """Yield the consistency of each filter: heading, legend and axis, then a line per verdict."""
     if not card.verdicts:
         return
     direction_text = "" if card.effect is None else f" {card.effect.axis}"
@@ -411,6 +424,7 @@ def _format_verdict_lines(card: DiagnosisCard) -> Iterator[Paragraph]:
 
 
 def _format_verdict_line(verdict: Verdict) -> Paragraph:
+    """Format a verdict: filter, quantity, ratio and verdict word, with a plot of the ratio."""
     label_text = f"  {FILTER_NAMES[verdict.filter]:4} {QUANTITY_LABELS[verdict.against]:26}"
     if verdict.ratio is None:
         verdict_text = f"{'–':>5}  not evaluated: {verdict.reason}"
@@ -425,6 +439,7 @@ def _format_verdict_line(verdict: Verdict) -> Paragraph:
 
 
 def _format_tick_labels() -> str:
+    """Return the labels of the axis of σ ratios as one line above the plots."""
     characters = [" "] * SIGMA_RATIO_AXIS_WIDTH
     for tick in LABELLED_RATIO_TICKS[1:-1]:
         label = RATIO_AXIS_TICKS[tick]
@@ -434,6 +449,7 @@ def _format_tick_labels() -> str:
 
 
 def _format_aid_lines(aid_rows: Sequence[AidConsistency]) -> Iterator[Paragraph]:
+    """Yield a caption, the axis, and the σ ratio of each aiding source; nothing without rows."""
     if not aid_rows:
         return
     yield Paragraph("")

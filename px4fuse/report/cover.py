@@ -105,8 +105,8 @@ def add_card(page: Page, card: DiagnosisCard) -> None:
         "file": shorten_to_line(card.identity.file, MAX_FILE_NAME_LENGTH),
         "flight": " · ".join(list_flight_texts(card)),
         "axis_text": AIDS_CAPTION if card.aids else ratio_text,
-        "axis_legend": f"grey: ratio of a consistent filter ({format_consistent_ratios()}) · ━ 95 "
-        "% interval · ◀ ▶: ratio outside the axis",
+        "axis_legend": f"grey: σ ratios of a consistent filter ({format_consistent_ratios()}) · "
+        "━ 95 % interval · ◀ ▶: ratio outside the axis",
         "ticks": [(map_ratio_to_axis(tick), label) for tick, label in RATIO_AXIS_TICKS.items()],
         "rows": [*map(_make_verdict_row, card.verdicts), *map(_make_aid_row, card.aids)],
         "causes": list(map(_make_cause_fields, card.causes)),
@@ -117,6 +117,7 @@ def add_card(page: Page, card: DiagnosisCard) -> None:
 
 
 def _make_verdict_row(verdict: Verdict) -> dict[str, Any]:
+    """Return the table row on the consistency of a filter, for the template ``cover.typ``."""
     word = f"{verdict.word}, explained" if verdict.is_explained else verdict.word
     return _make_sigma_ratio_row(
         verdict.ratio,
@@ -132,6 +133,7 @@ def _make_verdict_row(verdict: Verdict) -> dict[str, Any]:
 
 
 def _make_aid_row(aid: AidConsistency) -> dict[str, Any]:
+    """Return the table row on a component of an aiding source, for the template ``cover.typ``."""
     return _make_sigma_ratio_row(
         aid.ratio,
         filter="ekf2",
@@ -149,6 +151,7 @@ def _make_sigma_ratio_row(
     interval: tuple[float, float] | None = None,
     **fields: str | bool,
 ) -> dict[str, Any]:
+    """Return ``fields`` with the σ ratio (actual σ ÷ reported σ) and its place in the plot."""
     if sigma_ratio is None:
         return {"ratio": "", **fields}
     return {
@@ -159,6 +162,7 @@ def _make_sigma_ratio_row(
 
 
 def _make_cause_fields(cause: DiagnosedCause) -> dict[str, Any]:
+    """Return the fields of a cause with formatted texts, for the template ``cover.typ``."""
     formatted_fields = {
         "when": f"{cause.severity} · {format_spans(cause.spans_s) or 'whole flight'}",
         "actions": [
@@ -184,7 +188,7 @@ def write_panels(page: Page, analysis: Analysis, card: DiagnosisCard) -> None:
     _draw_innovations(right, analysis, plot_height)
     if not is_wide:
         section.add_columns(left, right)
-    page.add_columns(section)
+    page.add_columns(section)  # keeps the section on one page
 
 
 def _draw_error_plots(page: Page, analysis: Analysis, card: DiagnosisCard, height: float) -> None:
@@ -226,6 +230,7 @@ class _ErrorPlot(NamedTuple):
 
 
 def _compute_error_axis_limit_m(plot: _ErrorPlot) -> float:
+    """Return the limit (m) of the error axis for a plot: the largest error or 2.2 σ."""
     largest_error_m = max(float(plot.error_m.abs().max()), 1e-3)
     sigma_limits_m = [2.2 * sigma.median() for sigma in plot.sigmas_m.values()]
     # The error axis ends at 3 times the largest error: if the reported σ is much too large, its
@@ -236,6 +241,7 @@ def _compute_error_axis_limit_m(plot: _ErrorPlot) -> float:
 def _draw_error_plot(
     page: Page, analysis: Analysis, height: float, plot: _ErrorPlot, half_range_m: float
 ) -> None:
+    """Draw an error or difference over time with its ±2σ bands."""
     title, rms_m, error_m, sigmas_m = plot
     known_sigmas_m = {
         name: sigma.dropna() for name, sigma in sigmas_m.items() if sigma.notna().any()
@@ -260,6 +266,7 @@ def _draw_error_plot(
 
 
 def _draw_innovations(page: Page, analysis: Analysis, height: float) -> None:
+    """Draw the innovations ÷ √S of KF and EKF2 over time; KF is in front."""
     innovations = normalised_innovations(analysis.main)
     legend = ", ".join(f"{style.INNOVATION_SYMBOLS[name]} {name}" for name in innovations)
     title = f"Innovations ÷ √S ({legend}): 95 % expected within ±2; ▲▼ beyond ±{MAX_DRAWN_SIGMAS:g}"
@@ -322,6 +329,7 @@ def _draw_map(
     axis_names: tuple[str, str],
     height: float,
 ) -> None:
+    """Draw the tracks from above, with take-off and landing."""
     axes_width = page.width - AXES_LEFT_MARGIN - AXES_RIGHT_MARGIN
     limits = _compute_map_limits(tracks, axes_width / height)
     # Largest distance of a track beyond the limits: |position - position clipped to the limits|

@@ -62,7 +62,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     axes = add_time_panel(
         page,
         analysis,
-        "Position difference KF - EKF2 (m): total (dark) and unexplained part (light)",
+        "Position difference KF - EKF2 (m): total (dark), remainder after all replacements (light)",
         TIME_PLOT_HEIGHT,
     )
     unexplained_difference_m = pd.Series(explanation.unexplained_difference_m, explanation.times_s)
@@ -86,6 +86,7 @@ def describe_missing_explanation(analysis: Analysis) -> str:
 
 
 def format_replay_agreement(agreement: ReplayAgreement) -> str:
+    """State if the replay of EKF2 agrees with the log, without the last full stop."""
     sentences = [
         f"The replay {'agrees' if agreement.good else 'does not agree'} with the log "
         f"({agreement.reason})",

@@ -14,7 +14,7 @@ from .page import Page
 
 
 def make_findings_list() -> Page:
-    """List all detectable faults (findings)."""
+    """List all types of findings that px4fuse can report."""
     page = Page()
     for group in FINDING_GROUPS:
         page.write_heading(capitalise_first_letter(group))
@@ -38,7 +38,7 @@ def make_finding_page(finding_id: str) -> Page:
     name = finding_id.lower().replace("-", "_")
     if name not in FINDING_CATALOGUE:
         raise SettingsError(
-            f"{finding_id!r} is not a finding",
+            f"unknown finding id {finding_id!r}",
             f"{suggest_name(name, FINDING_CATALOGUE)}For a list of findings, run px4fuse explain.",
         )
     finding, example = FINDING_CATALOGUE[name], load_finding_examples()[name]

@@ -19,7 +19,7 @@ def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
     page.write(inventory.flight.log.name, bold=True)
     page.write_labelled_texts(dict(_describe_log(inventory)))
     for option in inventory.abilities:
-        label = "Possible analysis" if option.possible else "Not possible"
+        label = "This log permits" if option.possible else "Not possible"
         colour = GOOD_COLOUR if option.possible else SEVERITY_COLOURS["warning"]
         page.write(f"{label}: {option.name} ({option.reason})", colour=colour)
     if inventory.abilities[0].possible:  # comparison of KF and EKF2
@@ -51,6 +51,7 @@ def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
 
 
 def _describe_log(inventory: Inventory) -> Iterator[tuple[str, str]]:
+    """Yield pairs (label, text) on log, vehicle, time span, airborne times and input files."""
     log, airborne_spans = inventory.flight.log, inventory.flight.airborne
     size_text = f"{log.bytes / 1e6:.1f} MB" if log.bytes >= 1e5 else f"{log.bytes} bytes"
     yield "Log", f"{log.format}, {size_text}, SHA-256 {log.sha256[:12]}"

@@ -75,6 +75,7 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
 
 
 def _write_page(page: Page, loop: Loop) -> None:
+    """Write closure error, missing corrections, ATE, map, loop closures and RPE."""
     page.write(_describe_closure_error(loop))
     _write_segment(page, loop)
     # The first line of the page already states why the true end of the path is unknown, so this
@@ -124,6 +125,7 @@ def draw_map(axes: Axes, loop: Loop) -> None:
 
 
 def _draw_reference(axes: Axes, loop: Loop) -> None:
+    """Draw the first reference trajectory in the frame of the odometry."""
     if not loop.references:
         return
     name = loop.references[0].name
@@ -146,6 +148,7 @@ def make_loop_page(loop: Loop, findings: tuple[Finding, ...]) -> Page:
 
 
 def _write_ate(page: Page, loop: Loop) -> None:
+    """Write the ATE of each path against each reference, or advice to add a reference."""
     for reference in loop.references:
         page.write(f"ATE against {reference.name} (position RMSE after alignment):")
         for path in loop.select_reported_paths():
@@ -159,6 +162,7 @@ def _write_ate(page: Page, loop: Loop) -> None:
 
 
 def _write_segment(page: Page, loop: Loop) -> None:
+    """Write the source of the true end, and the evaluated part of the odometry."""
     odometry, true_end = loop.odometry.trajectory, loop.true_end
     true_end_text = "not used" if isinstance(true_end, Unavailable) else true_end.source
     page.write_labelled_text("True end", true_end_text)
@@ -170,6 +174,7 @@ def _write_segment(page: Page, loop: Loop) -> None:
 
 
 def _write_closures(page: Page, loop: Loop) -> None:
+    """Write the result of the χ² test of each loop closure, with rejected closures in red."""
     for closure in loop.closures:
         verb = "accepted" if closure.accepted else "rejected"
         text = (
@@ -201,6 +206,7 @@ def _write_rpe(page: Page, loop: Loop) -> None:
 
 
 def _make_rpe_row(path: PathResult, evaluation: Evaluation) -> list[str]:
+    """Return the table row of a path: correction, RPE over each distance or time, rotation RMSE."""
     # "RMSE m (95 % low to high)" becomes "RMSE m" with "low–high" on a second line, so that the
     # columns are narrow
     error_texts = [
@@ -220,11 +226,14 @@ def _format_span(loop: Loop) -> str:
 
 
 def _describe_closure_error(loop: Loop) -> str:
+    """State the loop closure error, its components and the heading error, if they are known."""
     error_m, error_components_m = loop.closure_error_m, loop.closure_error_axes_m
     length_m, heading_error_deg = loop.path_length_m, loop.heading_error_deg
     if error_m is None or error_components_m is None:
         if loop.is_assessed:
-            return f"Loop closure error hidden in student assignments; path length {length_m:.1f} m"
+            return (
+                f"Loop closure error not shown (student assignment); path length {length_m:.1f} m"
+            )
         reason = f": {loop.true_end.reason}" if isinstance(loop.true_end, Unavailable) else ""
         return f"Loop closure error unknown{reason}; path length {length_m:.1f} m"
     heading_text = (

@@ -80,8 +80,8 @@ def list_tuning_advice(
     if sigma_z.value is None and sigma_z.low is not None:
         yield (
             "SIGMA_Z",
-            f"SIGMA_Z has only a lower bound, {sigma_z.low:.2g} m. Possibly the source does not "
-            f"measure the position ({axis_name}).",
+            f"SIGMA_Z cannot be estimated, but is above {sigma_z.low:.2g} m. Possibly the source "
+            f"does not measure the position ({axis_name}).",
         )
     elif sigma_z.value is None:
         bound_text = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
@@ -98,8 +98,8 @@ def list_tuning_advice(
             "SIGMA_A",
             "SIGMA_A cannot be estimated: the flight has too little motion, or is too short."
             if sigma_a.low is None
-            else f"SIGMA_A has only a lower bound, {sigma_a.low:.2g} m/s²: logged acceleration and "
-            "positions disagree.",
+            else f"SIGMA_A cannot be estimated, but is above {sigma_a.low:.2g} m/s²: logged "
+            "acceleration and positions disagree.",
         )
     elif tuning.biases_fitted:
         yield (
@@ -123,8 +123,8 @@ def _make_vision_noise_advice(comparison: PreparedComparison, estimate: NoiseEst
     low_m, high_m = estimate.low or 0.0, estimate.high or np.inf
     variance_m2 = comparison.source.samples[Columns.POSITION_VARIANCE[:2]].median().mean()
     reported_sigma_m = 0.0 if np.isnan(variance_m2) else float(np.sqrt(variance_m2))
-    # The noise parameter, and the mode parameter if EKF2 uses a σ from the messages that is larger
-    # than the estimate
+    # Parameters that set EKF2's noise to the estimate: the noise parameter and, if the messages
+    # contain a larger σ, the mode parameter
     changes = make_noise_change(EV_POS, parameters, reported_sigma_m, estimate.value)
     noise_parameter_m = parameters.get(name, np.nan)
     # The σ from the messages is significantly too large: EKF2 must use its noise parameter instead

@@ -73,7 +73,7 @@ class FaultKind(Record):
 
     @property
     def standard_unit(self) -> str:
-        """First allowed unit; "" for a fault without size."""
+        """First unit that the form allows for the size; "" for a kind of fault without size."""
         return next(iter(self.units), "")
 
 
@@ -160,7 +160,11 @@ class NamedFault(Record):
     panel: str = ""
 
     def convert_size_to_standard_unit(self) -> float | None:
-        """Convert the size to the first unit of the fault in ``form.toml``, for example cm to m."""
+        """Convert the size to the standard unit of the fault, for example cm to m.
+
+        Return None if the size is blank, or if the kind of fault has no size. A blank unit is the
+        standard unit.
+        """
         units = FAULT_KINDS[self.kind].units
         if self.size is None or not units:
             return None
@@ -224,7 +228,7 @@ class FormQuestion(Record):
     update_number : int
         Number of the KF update, from 1. The first measurement only sets the state.
     question_parameter : float
-        Duration (s) of the prediction, or innovation gate (in √S); not used by other kinds.
+        For the kind "prediction": duration (s). For the kind "gate": innovation gate (in √S).
     """
 
     kind: QuestionKind
@@ -235,6 +239,7 @@ class FormQuestion(Record):
 
     @property
     def text(self) -> str:
+        """Question as the answer form prints it: quantity, update, and settings of KF."""
         update, number_text = self.update_number, f"{self.question_parameter:g}"
         quantity = {
             "gain": f"Kalman gain of the position in update {update}",
@@ -243,8 +248,8 @@ class FormQuestion(Record):
             "nis": f"NIS in update {update}",
             "prediction": f"position sigma of KF (m) {number_text} s after update {update}, "
             "without further updates",
-            "gate": f"numbers of all updates from {update} to "
-            f"{update + LATER_UPDATE_COUNT_IN_GATE_QUESTION} with an innovation outside "
+            "gate": f"numbers of the updates, from {update} to "
+            f"{update + LATER_UPDATE_COUNT_IN_GATE_QUESTION}, with an innovation outside "
             f"±{number_text} sqrt(S), if KF has no gate",
         }[self.kind]
         return f"{quantity}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
@@ -258,8 +263,8 @@ LATER_UPDATE_COUNT_IN_GATE_QUESTION = 20
 def select_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
     """Select three questions about KF at random, with the SHA-256 of the log as seed.
 
-    Each random choice uses the next byte of a hash. A change of their order would change the
-    questions of existing answer keys.
+    Each random choice uses the next byte of a hash. Keep the order of the choices: otherwise the
+    questions of existing answer keys change.
     """
     random_bytes = iter(hashlib.sha256(f"px4fuse answers {log_sha256}".encode()).digest())
 
@@ -268,8 +273,8 @@ def select_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
 
     sigmas = (draw_number_between(0.2, 0.45, 2), draw_number_between(0.06, 0.14, 3))
     kinds = [pair[next(random_bytes) % 2] for pair in _QUESTION_KIND_PAIRS]
-    # one of the kinds "prediction" and "gate" is always chosen, and it alone uses the parameter:
-    # duration (s) of the prediction, or innovation gate (in √S)
+    # Every form has a question about either "prediction" or "gate". Only these kinds use the
+    # parameter: duration (s) of the prediction, or innovation gate (in √S)
     parameter_range = (1.0, 4.0) if "prediction" in kinds else (0.8, 1.3)
     parameter = draw_number_between(*parameter_range, 1)
     # the first of the three questions is about one of the updates 2 to 8, in which the covariance
@@ -301,7 +306,7 @@ def read_answers(path: Path) -> Answers:
         form_values = _convert_form(tomllib.loads(form_toml))
         answers = msgspec.convert(form_values, Answers)
         check_answers(answers)
-    except (RecursionError, ValueError) as error:  # of tomllib, msgspec or check_answers
+    except (RecursionError, ValueError) as error:  # raised by tomllib, msgspec or check_answers
         message = _describe_error(error, form_toml, form_values)
         raise SettingsError(f"{path}: {message}", "Correct the answer form.") from error
     return answers
@@ -354,7 +359,8 @@ def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
     # msgspec finds all other unknown fields
     unknown_fields = (quantities.keys() - quantity_fields) | (choices.keys() - choice_fields)
     if "mistakes" in filled_form:
-        # Answers has a field "mistakes", but in a form only "mistake" is valid
+        # The class Answers has a field "mistakes", but in the answer form this field is called
+        # "mistake"
         unknown_fields.add("mistakes")
     if unknown_fields:
         raise ValueError(
@@ -371,6 +377,7 @@ def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
 
 
 def _remove_empty_values(value: Any) -> Any:
+    """Return the values of a form (dict, list or other value) without blank texts."""
     if isinstance(value, dict):
         return {
             key: _remove_empty_values(element) for key, element in value.items() if element != ""
@@ -412,6 +419,7 @@ def check_answers(answers: Answers) -> None:
 
 
 def _require_allowed_answer(field_name: str, answer: str, allowed_answers: Iterable[str]) -> None:
+    """Raise ValueError if an answer is not one of the allowed answers."""
     if answer not in allowed_answers:
         choices_text = _join_quoted(allowed_answers)
         fault = (

@@ -89,7 +89,7 @@ class Sines:
         return cls(angular_frequency, amplitude * np.cos(phase), amplitude * np.sin(phase))
 
     def compute_values(self, time_s: Array, array_count: int = 1) -> list[Array]:
-        """Return the sum of the sines on each axis, then its time derivatives.
+        """Return the oscillation (sum of sines) of each axis, then its time derivatives.
 
         The result contains ``array_count`` arrays with the shape (times, axes).
         """
@@ -305,6 +305,7 @@ def compute_direction(heading_deg: float) -> Array:
 
 
 def _plan_aisle_passes(flight_plan: _FlightBuilder, scenario: Scenario, speed_m_s: float) -> None:
+    """Add the passes along the aisle: accelerate, fly straight, stop, pause, and fly back."""
     velocity_m_s = speed_m_s * compute_direction(scenario.heading_deg)
     heading_follows_path = scenario.nose_follows_path and speed_m_s > 0.0
     pause_s = max(scenario.pause_s, TURN_ROUND_DURATION_S if heading_follows_path else 0.0)
@@ -330,10 +331,12 @@ def _plan_aisle_passes(flight_plan: _FlightBuilder, scenario: Scenario, speed_m_
 def _plan_square_laps(
     flight_plan: _FlightBuilder, scenario: Scenario, speed_m_s: float, open_end_m: float
 ) -> None:
+    """Add laps along a square, with a turn to the right by 90° at each corner."""
     max_open_end_m = scenario.length_m - scenario.speed_m_s * CORNER_DURATION_S
     if open_end_m > max_open_end_m:
         raise SettingsError(
-            f"--mistake open-end={open_end_m:g} is too large. Use at most {max_open_end_m:g} m."
+            f"--mistake open-end={open_end_m:g}: the distance from start to end of the path is too "
+            f"large. Use at most {max_open_end_m:g} m."
         )
     side_count = 4 * scenario.passes
     previous_velocity_m_s = np.zeros(3)

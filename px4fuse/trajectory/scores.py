@@ -19,14 +19,14 @@ from .model import Trajectory, cumulative_distance
 
 PairDistanceUnit = Literal["frames", "m", "s"]
 
-# Maximum relative error of the distance of a pose pair, as in the evo package
+# Maximum relative deviation of the distance of a pose pair from the requested distance, as in the
+# evo package
 MAX_RELATIVE_PAIR_DISTANCE_ERROR = 0.1
 DEFAULT_RPE_DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
 DEFAULT_RPE_TIMES_S = (1.0, 10.0, 60.0)
 MAX_DEFAULT_RPE_DISTANCES = 3
 MAX_DEFAULT_RPE_TIMES = 2
-# Minimum default path length between the two poses of an RPE pair, as fraction of the whole path
-# length
+# Lower limit of the default distance of RPE pairs, as fraction of the length of the path
 MIN_PAIR_DISTANCE_FRACTION_OF_PATH = 1 / 200
 # Maximum default path length (or time) between the two poses of an RPE pair, as fraction of the
 # whole path length (or duration)
@@ -137,6 +137,7 @@ def choose_default_deltas(distance_m: Array, time_s: Array) -> tuple[RpePairDist
     def choose_delta_values(
         distance_or_time: Array, values: Sequence[float], min_fraction: float
     ) -> list[float]:
+        """Return the allowed ``values``, in their order."""
         total = float(np.ptp(distance_or_time))
         minimum = max(min_fraction * total, 2.0 * compute_median_interval_s(distance_or_time))
         return [value for value in values if minimum <= value <= MAX_PAIR_DISTANCE_FRACTION * total]
@@ -188,12 +189,12 @@ def find_pose_pairs(
     if not all_pairs:
         return _find_consecutive_pairs(np.diff(distance_or_time), delta.value)
     start_indices = np.arange(pose_count - 1)
-    # Candidates for the second pose, one row per pair: the first pose at or above the distance, the
-    # pose before it, and their neighbours, because rounding errors may change the result. They are
-    # limited to the poses after the start
-    nearest_indices = np.searchsorted(distance_or_time, distance_or_time + delta.value)[:-1]
+    # Candidates for the second pose of each pair, one row per pair: the last two poses before the
+    # distance delta, and the first two poses at or after it. Rounding errors may change which one
+    # is nearest. All candidates are after the first pose
+    next_indices = np.searchsorted(distance_or_time, distance_or_time + delta.value)[:-1]
     candidate_indices = np.clip(
-        nearest_indices[:, None] + np.arange(-2, 2), start_indices[:, None] + 1, pose_count - 1
+        next_indices[:, None] + np.arange(-2, 2), start_indices[:, None] + 1, pose_count - 1
     )
     candidates = distance_or_time[candidate_indices]
     pair_distance_error = np.abs(candidates - distance_or_time[start_indices, None] - delta.value)
@@ -208,6 +209,7 @@ def find_pose_pairs(
 
 
 def _find_consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
+    """Return first and last indices of consecutive pose pairs with the distance ``delta``."""
     # For each pair, the sum of steps (distance or time) starts again at 0, as in the evo package.
     # Differences of one cumulative sum would have other rounding errors
     pair_ends = [0]
@@ -316,8 +318,8 @@ def estimate_rmse_interval(
     if error_count < MIN_BOOTSTRAP_BLOCKS * block_length:
         return Unavailable(
             f"95 % interval of the {analysis_name} RMSE",
-            f"{error_count} errors, correlated over {block_length} errors, give fewer than "
-            f"{MIN_BOOTSTRAP_BLOCKS:.0f} independent blocks for the bootstrap",
+            f"{error_count} errors form fewer than {MIN_BOOTSTRAP_BLOCKS:.0f} independent blocks "
+            f"of {block_length} errors for the bootstrap",
             "Use a longer flight.",
         )
     circular_errors = np.append(squared_errors, squared_errors[: block_length - 1])

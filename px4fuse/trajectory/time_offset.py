@@ -48,12 +48,11 @@ MAX_RELATIVE_MISFIT = 0.5
 # Lower limit of the residual ÷ extent of the motion (both RMS): below it, all fits count as equally
 # good
 MISFIT_FLOOR = 1e-3
-# A change of the alignment (shift, rotation, scale) can have the same effect as a time offset. The
-# velocity that it explains is removed. Minimum RMS of the remaining velocity ÷ RMS speed: below it,
-# the time offset is not determinable
+# Shift, rotation and scale can have the same effect as a time offset. Minimum RMS of the velocity
+# that they cannot explain ÷ RMS speed: below this limit, the time offset is not determinable
 MIN_RESIDUAL_VELOCITY_FRACTION = 0.05
-# Both trajectories must show the same motion. Minimum correlation between their velocities, after
-# removal of the velocity that a change of the alignment explains
+# Minimum correlation between the velocities of both trajectories, without the velocity that shift,
+# rotation and scale explain
 MIN_RESIDUAL_VELOCITY_CORRELATION = 0.5
 # Maximum lag in the variance estimate of Newey and West (1987) ÷ correlation length
 MAX_LAG_IN_CORRELATION_LENGTHS = 4
@@ -132,8 +131,8 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
     )
     if not accepted_fits:
         return _make_unknown_offset(
-            "at the time offsets with correlated speeds of both trajectories, the positions do not "
-            "match or too few poses overlap"
+            "at all time offsets with correlated speeds, the positions do not match or too few "
+            "poses overlap"
         )
     best_fit = accepted_fits[0]
     max_misfit = MIN_SECOND_BEST_RESIDUAL_RATIO * best_fit.compute_misfit()
@@ -320,9 +319,9 @@ def _compute_interval_half_width_s(
     sparse_track_velocity_m_s = fit.transform.to_rotation().apply(
         fit.transform.scale * _compute_velocity(sparse_track, fit.time_s)
     )
-    # 2. The alignment (shift, rotation, scale) is fitted together with the time offset. Velocity
-    # that a change of the alignment explains is removed, because it does not determine the time
-    # offset. Columns of the Jacobian: change of the positions by each of the 7 parameters
+    # Shift, rotation and scale can have the same effect as a time offset. Remove the part of the
+    # velocity that a change of these 7 parameters explains. Columns of the Jacobian: change of the
+    # positions by a shift along each axis, by a rotation about each axis, and by the scale
     centred_m = fit.aligned_position_m - fit.aligned_position_m.mean(axis=0)
     columns = [np.tile(axis, (pose_count, 1)) for axis in np.eye(3)]
     columns += [np.cross(axis, centred_m) for axis in np.eye(3)]
@@ -337,8 +336,8 @@ def _compute_interval_half_width_s(
     dense_residuals, sparse_residuals = residual_velocities.T
     dense_track_square_sum = float(dense_residuals @ dense_residuals)
     sparse_track_square_sum = float(sparse_residuals @ sparse_residuals)
-    # 3. The remaining velocity must not be small, and must be the same motion in both trajectories,
-    # not noise
+    # The remaining velocity, which shift, rotation and scale do not explain, must not be small. It
+    # must be the same motion in both trajectories, not noise
     if (
         dense_track_square_sum
         <= MIN_RESIDUAL_VELOCITY_FRACTION**2 * float((dense_track_velocity_m_s**2).sum())
@@ -406,6 +405,7 @@ def _refine_offset(
     sparse_position_m = sparse_track.position_m[pose_indices]
 
     def make_fit(shift_s: float) -> _OffsetFit:
+        """Fit the sparse trajectory to the dense one at the time offset lag_s + shift_s."""
         dense_track_position_m = interpolate_columns(
             sparse_time_s + (lag_s + shift_s), dense_track.time_s, dense_track.position_m
         )
@@ -421,6 +421,7 @@ def _refine_offset(
         )
 
     def compute_cost(shift_s: float) -> float:
+        """Return the sum of the squared position residuals (m²) at the offset lag_s + shift_s."""
         fit = make_fit(shift_s)
         return float(((fit.dense_track_position_m - fit.aligned_position_m) ** 2).sum())
 

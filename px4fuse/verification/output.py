@@ -47,7 +47,9 @@ def verification_page(name: str, verification: Verification, output: Path | None
     for sentence in sentences:
         page.write(sentence, indent=12.0)
     if output is not None and not verification.redrawn_pdf:
-        page.write("The output file (-o) was not written: the analysis could not be repeated.")
+        page.write(
+            "px4fuse did not write the output file (-o), because it could not repeat the analysis."
+        )
     elif output is None and verification.pages:
         page.write("Action: write the recomputed report with -o FILE.pdf, and read FILE.pdf.")
     page.write_muted_text(VERIFICATION_SCOPE_NOTE)

@@ -43,8 +43,9 @@ from .pdf_input import (
 COORDINATE_TOLERANCE_PT = 0.25
 # Tolerance of PDF numbers except coordinates: programs may save 32-bit floats
 PDF_NUMBER_TOLERANCE = 1e-5
-# Maximum kerning (1/1000 em) of a text in a submitted PDF in which a number may be rounded to
-# another last digit: a larger kerning could display the digits in another order
+# A text in a submitted PDF may contain a number with another last digit, due to rounding. The
+# kerning of this text must be below the limit (1/1000 em), because a large kerning could move
+# digits to other places
 MAX_KERNING_PER_MILLE_EM = 200.0
 # Maximum size of a page's content in the submitted PDF ÷ in the redrawn PDF (generated again by
 # px4fuse). Escape sequences need four bytes per character
@@ -117,6 +118,7 @@ def compare_pages(
 
 
 def _compare_pdfs(job: tuple[bytes, bytes, TextComparison]) -> tuple[PageDifference, ...]:
+    """Compare two PDFs, and return at most MAX_LISTED_DIFFERENCES differences of values."""
     submitted_bytes, redrawn_bytes, is_same_text = job
     try:
         with pypdf.apply_configuration(**PYPDF_LIMITS):
@@ -146,8 +148,8 @@ class _PdfComparison:
     # pairs of PDF objects that are already compared: object number and generation in the submitted
     # PDF, and object number in the redrawn PDF
     compared_objects: set[tuple[int, int, int]] = field(default_factory=set)
-    # stack of pairs of PDF values that are not yet compared: the current page (or a value compared
-    # after all pages), and values nested in it
+    # stack of PDF value pairs that are still to be compared: usually a page, and the values nested
+    # in it
     pairs_to_compare: list[_ValuePair] = field(default_factory=list)
     # pairs of PDF values that are compared after all pages: document information, catalogue, and
     # parents of pages
@@ -169,8 +171,10 @@ class _PdfComparison:
         ]
         for page_number, (submitted_page, redrawn_page) in enumerate(zip_longest(*pages), start=1):
             if submitted_page is None or redrawn_page is None:
-                page_counts = f"{len(pages[0])} pages; the recomputed report has {len(pages[1])}"
-                yield PageDifference(page_number, f"the PDF has {page_counts}")
+                yield PageDifference(
+                    page_number,
+                    f"the PDF has {len(pages[0])} pages; the recomputed report has {len(pages[1])}",
+                )
                 return
             self.fonts = resolve_reference(redrawn_page.get_object()["/Resources"].get("/Font", {}))
             for difference in self._compare((submitted_page, redrawn_page, "/Page")):
@@ -264,6 +268,7 @@ class _PdfComparison:
             yield from self._compare_streams(submitted_dictionary, redrawn_dictionary, key)
 
     def _is_same_value(self, submitted_value: Any, redrawn_value: Any) -> bool:
+        """Return True if two PDF values of the same simple type are equal."""
         if _pdf_type_of(redrawn_value) is float:
             return math.isclose(
                 submitted_value,
@@ -282,6 +287,7 @@ class _PdfComparison:
     def _compare_streams(
         self, submitted_stream: StreamObject, redrawn_stream: StreamObject, key: str
     ) -> Iterator[_PdfDifference]:
+        """Yield the difference in the content of two PDF streams, after decompression."""
         stream_type = redrawn_stream.get("/Type")
         if stream_type == "/EmbeddedFile":  # attached results: compared in verification.py
             return
@@ -327,8 +333,8 @@ class _PdfComparison:
             # the operator TJ prints several strings, and a number between two strings (kerning)
             # moves the second string
             kerning = [abs(value) for value in submitted_operands if isinstance(value, float)]
-            # tolerate a difference only if a number was rounded to another last digit. Equal texts
-            # differ in their kerning, which is not tolerated
+            # a different text is tolerated only if a number was rounded to another last digit. If
+            # the texts are equal, only the kerning differs, which is not tolerated
             if (
                 submitted_text == redrawn_text
                 or max(kerning, default=0.0) >= MAX_KERNING_PER_MILLE_EM

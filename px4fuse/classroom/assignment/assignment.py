@@ -201,15 +201,16 @@ def _exists_with_same_content(path: Path, content: bytes) -> bool:
     if path.is_file() and path.stat().st_size == len(content) and path.read_bytes() == content:
         return True
     raise OutputError(
-        f"{path} exists with other content and was not overwritten. Give the secret and the "
-        "options of the command that wrote the file, or choose another folder (-o)."
+        f"{path} exists with other content and was not overwritten. Repeat the command that "
+        "wrote the file with the same secret and options, or choose another folder (-o)."
     )
 
 
 def _require_answer_key_of_same_flights(key_file: Path, has_same_flights: bool) -> None:
+    """Raise an OutputError if the answer key is of other flights or of another class."""
     if not has_same_flights:
         raise OutputError(
             f"{key_file} is the answer key of other flights and was not overwritten. Choose "
-            "another file with --answer. To add students to the key, give the secret and options "
-            "of its command, and all students."
+            "another file with --answer. To add students to the key, repeat the command that "
+            "wrote it, with the same secret and options, and all students."
         )

@@ -30,7 +30,7 @@ QUESTIONS = {
     "evidence": "plots that show the fault, and plots that do not show the fault",
     "change": "smallest change of data or settings after which both KF and EKF2 are consistent",
     "prediction": "effect on KF and EKF2 if SIGMA_Z and EKF2_EVP_NOISE are multiplied by 3",
-    "useless": "change of data or settings that does not correct the fault, and the reason",
+    "useless": "change of data or settings that does not correct the fault, and why not",
 }
 
 
@@ -40,6 +40,7 @@ FIGURE_ANSWERS_BY_FAULT = read_toml(__file__, dict[str, dict[str, str]])
 
 
 def _shuffle(names: Iterable[str], seed_prefix: str, draw_number: DrawRandomNumber) -> list[str]:
+    """Sort names in random order; the same arguments always give the same order."""
     return sorted(names, key=lambda name: draw_number(f"{seed_prefix} {name}"))
 
 
@@ -145,6 +146,7 @@ def _draw_errors(axes: style.Axes, result: AxisComparison, filter_name: FilterNa
 
 
 def _draw_map(axes: style.Axes, comparison: Comparison) -> None:
+    """Plot positions, EKF2 and ground truth in the horizontal plane."""
     axes.set_title("Map: positions (dots), EKF2 (line), ground truth (dotted line)")
     ekf2, truth = comparison.flight.ekf2, comparison.flight.truth
     assert isinstance(ekf2, Ekf2)

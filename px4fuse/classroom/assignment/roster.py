@@ -64,6 +64,7 @@ class Sheet:
         return "" if column_index is None else row[column_index].strip()
 
     def content(self) -> bytes:
+        """Return the table as a CSV file, with the original separator and encoding (or UTF-8)."""
         text = format_csv((self.column_titles, *self.rows), self.separator)
         try:
             return text.encode(self.encoding)
@@ -119,10 +120,13 @@ def read_csv_sheet(path: Path) -> Sheet:
     # do not count separators in quoted column titles
     separator = max(COLUMN_SEPARATORS, key=re.sub(r'"[^"]*"', "", header).count)
     try:
-        lines = [*csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)]
+        rows_of_cells = [
+            *csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
+        ]
     except csv.Error as error:
         raise SettingsError(f"{path} is not a CSV file ({error}).") from error
-    column_titles, *rows = [cells for cells in lines if any(map(str.strip, cells))] or [[]]
+    # the first row with a text is the header; [[]] gives an empty header for an empty file
+    column_titles, *rows = [cells for cells in rows_of_cells if any(map(str.strip, cells))] or [[]]
     if not column_titles:
         raise SettingsError(f"{path} is empty.", csv_remedy)
     padded_rows = (tuple(cells + [""] * (len(column_titles) - len(cells))) for cells in rows)
@@ -280,6 +284,7 @@ class ClassList:
     """
 
     def __init__(self, people: Iterable[Person] = (), *other_lists: Iterable[Person]) -> None:
+        """Make a class list, and add data of the same students from other lists."""
         self.people = list(people)
         for other_person in chain.from_iterable(other_lists):
             student_index = self.find_student_index(other_person)
@@ -296,7 +301,8 @@ class ClassList:
     def find_student_index(self, searched_person: Person) -> int | None:
         """Return the index of a person in ``people``; None for an unknown person.
 
-        The fields are compared in this order: platform number, id, email, login, name.
+        The fields are compared in this order: number on the platform, id, email, login, name. The
+        first field that matches exactly one student decides.
         """
         conditions: tuple[Callable[[Person], bool], ...] = (
             lambda person: bool(person.numbers.items() & searched_person.numbers.items()),
@@ -325,6 +331,8 @@ def _is_same_text(text: str, other_text: str) -> bool:
 
 def is_same_id(student_id: str, other_id: str) -> bool:
     """Return True if two ids differ at most in case and leading zeros.
+
+    Return False for ids that are empty or contain only zeros.
 
     >>> is_same_id("0042", "42"), is_same_id("S1", "s1 "), is_same_id("00", "0")
     (True, True, False)

@@ -174,7 +174,11 @@ class ScoringInput:
         return any(finding.id in ids for finding in self.results.findings)
 
     def find_missing_reason(self, path: str) -> str:
-        """Return the reason for a value missing in the results, in brackets; "" if unknown."""
+        """Return the reason for a missing value at ``path``, in brackets; "" if unknown.
+
+        The results contain a field "reason" in place of missing data: at this path, or at one of
+        its parents.
+        """
         parent_path = path
         while parent_path:
             for _, reason in find_values(self.values, f"{parent_path}.reason"):
@@ -249,6 +253,7 @@ class NumberItem(RubricItem, tag="number"):
         return max(self.at_least - number, number - self.at_most)
 
     def _score_number(self, number: float) -> float:
+        """Return 1 within the bounds, and 0 from ``zero_at`` on; linear in between."""
         excess = self._compute_excess(number)
         if excess <= 0.0:
             return 1.0
@@ -256,6 +261,7 @@ class NumberItem(RubricItem, tag="number"):
         return 0.0 if excess >= excess_at_zero_score else 1.0 - excess / excess_at_zero_score
 
     def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
+        """Score the worst of all numbers that ``path`` matches."""
         values = find_values(scoring_input.values, self.path)
         numbers = [
             (self._score_number(value), value, path) for path, value in values if is_number(value)
@@ -279,6 +285,7 @@ class AnswersItem(RubricItem, tag="answers"):
     needs_answer_key: ClassVar[bool] = True
 
     def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
+        """Score the answer form: the sum of the points of its parts."""
         points_or_reason = scoring_input.form_points
         if isinstance(points_or_reason, str):
             return 0.0, f"{capitalise_first_letter(points_or_reason)}."
@@ -327,6 +334,7 @@ class TuningItem(RubricItem, tag="tuning", rename={"factor_at_zero_score": "fact
     factor_at_zero_score: ErrorFactorAtZeroScore = 2.0
 
     def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
+        """Score the chosen SIGMA_A or SIGMA_Z: full points in the 95 % interval of the estimate."""
         comparison = scoring_input.comparison
         label, unit, option = NOISE_SETTINGS[self.setting]
         chosen_value: float = getattr(comparison.settings, self.setting)
@@ -345,6 +353,8 @@ class TuningItem(RubricItem, tag="tuning", rename={"factor_at_zero_score": "fact
             # If the source drifts, SIGMA_Z may be as large as the position error: the estimate of
             # SIGMA_Z is from innovations, which do not contain the drift
             upper_bound = max(upper_bound, _find_max_position_error_m(comparison))
+        # setting ÷ upper limit or lower limit ÷ setting, at least 1: larger than 1 only outside the
+        # interval
         deviation_factor = max(
             chosen_value / upper_bound if upper_bound > 0.0 else math.inf,
             lower_bound / chosen_value,
@@ -383,6 +393,7 @@ class ConsistencyItem(RubricItem, tag="consistent", rename={"factor_at_zero_scor
     factor_at_zero_score: ErrorFactorAtZeroScore = 2.0
 
     def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
+        """Score the consistency of KF in the horizontal plane."""
         nis_result = scoring_input.comparison.horizontal.get("kf")
         if not isinstance(nis_result, HorizontalNis):
             reason_text = scoring_input.find_missing_reason(f"{HORIZONTAL}.kf")
@@ -425,6 +436,7 @@ class TimeOffsetItem(RubricItem, tag="clock"):
     undeterminable: Share = 0.5
 
     def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
+        """Score the time offset that the student applied."""
         clock = scoring_input.comparison.clock
         if not isinstance(clock, SourceTimeOffset) or not clock.is_determinable:
             reason_text = format_reason(clock.reason or "")
@@ -433,8 +445,8 @@ class TimeOffsetItem(RubricItem, tag="clock"):
             # assigned flight, so they get full points
             if scoring_input.right_answers is not None:
                 return 1.0, statement
-            # the flight is the student's own: without any estimate, for example because the log has
-            # no IMU data, the student gets no points
+            # A flight that the student chose: no points without an estimate (for example no IMU
+            # data), a part of the points for an uncertain estimate
             return self.undeterminable if isinstance(clock, SourceTimeOffset) else 0.0, statement
         (low, high), applied_offset_s = clock.interval_s, clock.applied_s
         statement = (
@@ -449,7 +461,7 @@ class TimeOffsetItem(RubricItem, tag="clock"):
                 return 1.0, "The time offset changes during your flight, as your form states."
             return self.undeterminable, (
                 "The time offset changes during your flight. State the time of the change in your "
-                "form."
+                "answer form."
             )
         return 0.0, f"{statement} Use --clock-offset auto to apply the estimate."
 
@@ -476,6 +488,7 @@ class LoopItem(RubricItem, tag="loop"):
     """
 
     def score(self, scoring_input: ScoringInput) -> ScoreAndReason:
+        """Score the loop closure: measured (1/4), accepted (1/2), path corrected (full points)."""
         loop = scoring_input.results.loop
         has_accepted_closure = isinstance(loop, Loop) and any(
             each.accepted for each in loop.closures

@@ -104,6 +104,7 @@ def _format_statistics(grades: Sequence[Grade], count_by_tag: Mapping[str, int])
 
 
 def _make_grade_tags(grade: Grade) -> list[str]:
+    """Return the tags by which the class page filters a grade, for example "late" and "pending"."""
     report = grade.counted_report
     tags = [report.status if report else NO_SUBMISSION_STATUS]
     tags += ["flagged"] * bool(grade.flags) + ["late"] * bool(grade.lateness_s)
@@ -119,6 +120,7 @@ def _make_grade_tags(grade: Grade) -> list[str]:
 
 
 def _make_grade_row(grade: Grade, item_titles: Sequence[str]) -> Row:
+    """Return the table row of a student, with details and links that the reader can open."""
     report = grade.counted_report
     status = report.status if report else NO_SUBMISSION_STATUS
     css_class, symbol = STATUS_STYLES[status]
@@ -211,6 +213,7 @@ def _make_points_cell(grade: Grade) -> Cell:
 
 
 def _make_points_input_boxes(grade: Grade) -> RowDetailsSection:
+    """Return input boxes for the points and comments of the instructor."""
     report = grade.counted_report
     max_points_by_title = {
         item.title: item.max_points
@@ -285,7 +288,7 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
     for report in final_reports:
         for kind, is_named in report.did_student_name_fault.items():
             scores_by_title[f"Fault: {kind}"].append(_ItemPoints(is_named, 1.0, report.points))
-    statistics = []
+    statistics_of_items = []
     for title, scores in scores_by_title.items():
         # one array over the reports for each field of _ItemPoints
         points, max_points, points_of_other_items = np.transpose(scores)
@@ -293,7 +296,7 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
         has_variation = np.ptp(points) > 0.0 and np.ptp(points_of_other_items) > 0.0
         if len(scores) >= MIN_REPORTS_FOR_CORRELATION and has_variation:
             discrimination = float(np.corrcoef(points, points_of_other_items)[0, 1])
-        statistics.append(
+        statistics_of_items.append(
             ItemStatistics(title, float(points.mean()), float(max_points.max()), discrimination)
         )
-    return statistics
+    return statistics_of_items

@@ -282,7 +282,12 @@ def _flag_submission(
     student_index: int | None,
     class_list: ClassList,
 ) -> Iterator[str]:
-    """Yield sentences about the time and the student of a submission."""
+    """Yield warnings about time and student of a submission.
+
+    Reasons are a late submission without a known time, an imitated file name of a platform, and an
+    id in the report that is not the id of the student on the platform. ``lateness_s`` is None if
+    due time or submission time are unknown. ``student_index`` is None for an unknown student.
+    """
     origin = report.origin
     platform = origin.platform.capitalize()
     if origin.is_late and lateness_s is None:
@@ -309,13 +314,16 @@ def _flag_submission(
 
 
 def _choose_counted_report(candidates: Sequence[_CandidateReport], course: Course) -> Grade:
+    """Choose the report of a student that counts: best, first or last, as the course specifies."""
     candidates = sorted(candidates, key=lambda each: each.time_s)
     # prefer reports without open decisions of the instructor
     readable_reports = [each for each in candidates if each.report.version]
-    final = [each for each in readable_reports if not each.report.instructor_action]
-    eligible_candidates = final or readable_reports or candidates
+    # reports without an open decision of the instructor
+    final_reports = [each for each in readable_reports if not each.report.instructor_action]
+    eligible_candidates = final_reports or readable_reports or candidates
 
     def rank(candidate: _CandidateReport) -> tuple[float, float, str]:
+        """Return the sort key of a report: the report with the largest key counts."""
         points = max(candidate.report.points - candidate.grade.deducted_points, 0.0)
         # the name decides between reports with equal time and points
         time_s, name = candidate.time_s, candidate.report.submission
@@ -341,8 +349,8 @@ def _choose_counted_report(candidates: Sequence[_CandidateReport], course: Cours
                 "student which report counts."
             )
             report = replace(report, instructor_action=action)
-    others = [each for each in candidates if each is not chosen]
-    for other in others:
+    other_candidates = [each for each in candidates if each is not chosen]
+    for other in other_candidates:
         is_pending = other.report.instructor_action or not other.report.version
         if is_pending and other.time_s >= chosen.time_s:
             status = "pending" if other.report.version else "not a report"
@@ -351,7 +359,7 @@ def _choose_counted_report(candidates: Sequence[_CandidateReport], course: Cours
     return replace(
         chosen.grade,
         counted_report=report,
-        other_reports=tuple(other.report for other in others),
+        other_reports=tuple(other.report for other in other_candidates),
         flags=tuple(flags),
     )
 
@@ -488,7 +496,7 @@ def match_overrides(
         }
         if report:
             max_points_by_title |= {item.title: item.max_points for item in report.items}
-        # case and outer blanks may differ
+        # Titles are compared without case and without blanks at start and end
         title_by_normalised_title = {normalise_text(title): title for title in max_points_by_title}
         for item_title, override in override_by_item.items():
             title, problem = title_by_normalised_title.get(normalise_text(item_title)), ""

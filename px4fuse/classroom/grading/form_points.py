@@ -128,7 +128,7 @@ def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> 
     matches, wrongly_named_faults = _match_faults(answers, right_answers)
     if is_recognised_as_fault_free:
         scores["mistakes"] = 1.0
-    elif len(wrongly_named_faults) < MIN_FALSE_FAULTS_FOR_ZERO_POINTS:  # otherwise guesses
+    elif len(wrongly_named_faults) < MIN_FALSE_FAULTS_FOR_ZERO_POINTS:  # else guessed
         scores |= _score_faults(matches, right_answers)
     scores["numbers"] = _score_numbers(answers, right_answers)
     scores["verdicts"] = _score_verdicts(answers, right_answers)
@@ -138,7 +138,7 @@ def compute_form_points(answers: Answers, right_answers: CorrectFormAnswers) -> 
     # points of each part
     points = {name: max_points * scores[name] for name, max_points in weights.items()}
     if right_answers.mistakes and all(fault.size is None for fault in right_answers.mistakes):
-        # no injected fault has a size: the points for sizes are given for the right fault names
+        # No injected fault has a size, so the right fault names also earn the points for sizes
         points["mistakes"] += weights["sizes"] * scores["mistakes"]
     deduction = flight_points_fraction * FALSE_FAULT_DEDUCTION * len(wrongly_named_faults)
     points["mistakes"] = max(points["mistakes"] - deduction, 0.0)
@@ -189,7 +189,7 @@ def describe_right_answer(fault: InjectedFault) -> str:
     texts = []
     if fault.low is not None and fault.high is not None:
         unit = FAULT_KINDS[fault.kind].standard_unit
-        texts.append(f"right fault size {fault.low:.3g} to {fault.high:.3g} {unit}".rstrip())
+        texts.append(f"accepted fault size {fault.low:.3g} to {fault.high:.3g} {unit}".rstrip())
     start_text = "" if fault.from_s is None else f"from {fault.from_s:.0f} s "
     end_text = "" if fault.until_s is None else f"until {fault.until_s:.0f} s"
     texts.append(f"{start_text}{end_text}".strip() or "whole flight")
@@ -197,7 +197,7 @@ def describe_right_answer(fault: InjectedFault) -> str:
 
 
 def _describe_wrong_answers(answers: Answers, right_answers: CorrectFormAnswers) -> Iterator[str]:
-    """Yield feedback on wrong answers about consistency, EKF2, numbers and figures."""
+    """Yield feedback on wrong answers: consistency, EKF2, numeric questions and plots."""
     # question, answer of the student, and right answer. Answers that are accepted although they
     # differ from the right answer are not added
     rows: list[tuple[str, object, object]] = [
@@ -231,6 +231,8 @@ class AnsweredChoice(NamedTuple):
 def list_answered_choices(
     answers: Answers, right_answers: CorrectFormAnswers
 ) -> list[AnsweredChoice]:
+    """Return the multiple-choice questions of the answer key with the student's letters."""
+    # letters of the student, filled with "" to at least the number of questions
     letters = (*answers.choices, *[""] * len(right_answers.choices))
     return [
         AnsweredChoice(*right_choice, letter)
@@ -394,7 +396,11 @@ AcceptedCorrection = tuple[str, tuple[float, float], float]
 def find_accepted_corrections(
     fault: InjectedFault, right_answers: CorrectFormAnswers
 ) -> list[AcceptedCorrection]:
-    """Return the rows of ``corrections.csv`` for a fault, with numbers as ranges."""
+    """Return the corrections that are accepted for a fault (rows of ``corrections.csv``).
+
+    Each correction has the range of its accepted values. The file states this range, or its name. A
+    named range depends on size and time of the injected fault, or on the true position noise.
+    """
     size, lower_bound, upper_bound = (value or 0.0 for value in (fault.size, fault.low, fault.high))
     fault_start_s = fault.from_s or 0.0
     fault_end_s = fault_start_s if fault.until_s is None else fault.until_s
@@ -405,11 +411,11 @@ def find_accepted_corrections(
         # value that cancels the fault
         "negated": (-upper_bound, -lower_bound),
         "size": (lower_bound, upper_bound),
-        # delay (ms) for a time offset (s)
+        # Range of a time offset in ms (injected in s)
         "late milliseconds": (1e3 * lower_bound, 1e3 * upper_bound),
-        # IMU log rate (Hz): at least twice the injected rate, which is too low
+        # Range of IMU log rates (Hz): at least twice the rate that the fault injected
         "twice": (2.0 * size, 1e4),
-        # scale factors that correct distances that are wrong by a scale factor error (per cent)
+        # Range of factors that correct a scale factor error of lower_bound to upper_bound per cent
         "factors": (100.0 / (100.0 + upper_bound), 100.0 / (100.0 + lower_bound)),
         # measurement noise σ (m): with 0.8 to 1.25 times the true σ, a filter is consistent
         "noise": (0.8 * right_answers.sigma_z_m, 1.25 * right_answers.sigma_z_m),
@@ -441,13 +447,17 @@ def _score_verdicts(answers: Answers, right_answers: CorrectFormAnswers) -> floa
 
 
 def _score_ekf2_behaviour(answers: Answers, right_answers: CorrectFormAnswers) -> float:
-    """Return 1 if the reported behaviour of EKF2 is right, 1/2 with one error, otherwise 0."""
+    """Return the score (0, 1/2 or 1) of the behaviours of EKF2 that a student reports.
+
+    The score is 1 for all required behaviours without a false one. It is 0 without any right
+    behaviour, or with several false ones. Otherwise it is 1/2.
+    """
     stated, required = set(answers.ekf2_did), set(right_answers.ekf2_did)
     right = stated & {*required, *right_answers.ekf2_did_also}
     false_count = len(stated - right)
     if not right or false_count > 1:
         return 0.0
-    # if only one behaviour is required, an allowed behaviour (ekf2_did_also) may replace it
+    # If only one behaviour is required, an allowed behaviour (ekf2_did_also) may replace it
     is_complete = required <= stated or len(required) == 1
     return 1.0 if is_complete and not false_count else 0.5
 
@@ -472,6 +482,7 @@ def _score_numbers(answers: Answers, right_answers: CorrectFormAnswers) -> float
 
 
 def _score_number(answer: NumericAnswer, right_answer: NumericAnswer) -> float:
+    """Return the score (0, 1/2 or 1) of a number, or of a list of numbers."""
     if isinstance(right_answer, tuple) and answer is not None:
         # list of numbers: each missing and each false number costs half of the points
         given, right = set(answer if isinstance(answer, tuple) else (answer,)), set(right_answer)

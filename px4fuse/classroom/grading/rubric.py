@@ -92,7 +92,7 @@ class Rubric(Record, kw_only=True):
     others_log : {"pending", "zero", "count"}
         Rule for a report on the log of another student.
     pages : {"count", "pending", "zero"}
-        Rule for a report with verified numbers, but changed pages.
+        Rule for a report with verified numbers whose pages differ from the recomputed report.
     """
 
     title: OneLineText = ""
@@ -129,6 +129,7 @@ def read_rubric(path: Path | None) -> Rubric:
 
 
 def parse_rubric(text: str, source_name: str) -> Rubric:
+    """Parse and check the text (TOML) of a rubric."""
     try:
         return msgspec.convert(tomllib.loads(text), Rubric)
     # tomllib raises ValueError for a syntax error, and for an integer with very many digits
@@ -197,6 +198,7 @@ def score_report(
 
 
 def _score_items(scoring_input: ScoringInput, rubric: Rubric) -> Iterator[ItemScore]:
+    """Yield the points of each rubric item that applies to the command of the report."""
     command = "loop" if isinstance(scoring_input.results, LoopResults) else "compare"
     has_text = bool(scoring_input.results.student.notes.strip())
     for item in rubric.items:
@@ -213,6 +215,7 @@ def _score_items(scoring_input: ScoringInput, rubric: Rubric) -> Iterator[ItemSc
 
 
 def _flag_report(scoring_input: ScoringInput) -> Iterator[str]:
+    """Yield flags about changed pages, unusual settings, and a log or form of another student."""
     page_differences = scoring_input.verification.pages
     if page_differences:
         yield (
@@ -254,7 +257,7 @@ def _find_problems(
         yield "pending", FORM_MISMATCH_REASON, FORM_MISMATCH_ADVICE
     if scoring_input.key is not None and getattr(scoring_input.results.request, "position", None):
         action = (
-            "Ask the student for the source of the position file: students are given a log only."
+            "Ask the student where the position file comes from: students are given a log only."
         )
         yield "pending", "", action
 
@@ -262,14 +265,15 @@ def _find_problems(
 def _make_other_students_log_advice(scoring_input: ScoringInput) -> str:
     """Return the action of the instructor for a report on the log of another student."""
     student_id = shorten_text(scoring_input.results.student.id)
-    id_text = f"the report states the id {student_id}" if student_id else "the report states no id"
+    id_text = f"the student id {student_id}" if student_id else "no student id"
     if scoring_input.right_answers is None:
         return (
             "The log of the report is not in the answer key. Ask for a report on the assigned log."
         )
     assigned_id = shorten_text(scoring_input.right_answers.student_id)
     advice = (
-        f"Ask who wrote the report: its log was assigned to student {assigned_id}, but {id_text}."
+        f"Ask who wrote the report: its log was assigned to student {assigned_id}, but the report "
+        f"contains {id_text}."
     )
     if scoring_input.submitter_id:
         advice += f" Student {shorten_text(scoring_input.submitter_id)} submitted the report."
@@ -353,7 +357,11 @@ def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequenc
 
 
 def _find_equal_contents(report: GradedReport, other: GradedReport) -> Iterator[str]:
-    """Yield a sentence for each content that is equal in two reports; "{}" is the other report."""
+    """Yield a sentence for each part that two reports have in common; "{}" is the other report.
+
+    Parts are the PDF, the student id, the log, the numbers, and the answers of the form. The same
+    log and equal forms are reported only for two different students.
+    """
     is_other_student = _identify_student(report) != _identify_student(other)
     is_same_log = report.log_sha256 == other.log_sha256
     if report.sha256 == other.sha256 != "":
@@ -409,6 +417,7 @@ def _is_same_number(answer: NumericAnswer, other_answer: NumericAnswer) -> bool:
 
 
 def _identify_student(report: GradedReport) -> str:
+    """Return a text that identifies the student: id, else name, else submitted file."""
     return normalise_text(report.student_id) or normalise_text(report.student) or report.submission
 
 

@@ -31,13 +31,13 @@ class _FrontalMatrix(NamedTuple):
     # Range of the unknowns that are eliminated in this front, and indices of the remaining unknowns
     unknowns: slice
     remaining_unknowns: IntArray
-    # Range of the matrix blocks (one for each pair of poses) that belong to the columns of the
-    # eliminated poses, and row and column of each block in the front, counted in blocks
+    # Range of the matrix blocks (one for each pair of poses) in the columns of the eliminated
+    # poses, and row and column of each block in the frontal matrix, counted in blocks
     blocks: slice
     block_rows: IntArray
     block_columns: IntArray
-    # Index of the parent front, which eliminates the first of the remaining unknowns, and rows of
-    # the remaining unknowns in the parent front
+    # Index of the parent frontal matrix, which eliminates the first of the remaining unknowns, and
+    # rows of the remaining unknowns in the parent frontal matrix
     parent_index: int
     rows_in_parent: IntArray
 
@@ -55,6 +55,7 @@ class NormalEquations:
     """
 
     def __init__(self, edges: IntArray, unknowns_per_pose: int) -> None:
+        """Plan the multifrontal solution: order of elimination, blocks and frontal matrices."""
         # Poses are numbered by their position in the order of elimination
         position, eliminated_counts, poses_by_front = _find_elimination_order(
             edges, _MAX_LEAF_UNKNOWNS // unknowns_per_pose
@@ -69,13 +70,14 @@ class NormalEquations:
         blocks, block_indices = np.unique(columns * len(position) + rows, return_inverse=True)
         block_columns, block_rows = np.divmod(blocks, len(position))
 
-        def enumerate_numbers(indices: IntArray, count: int) -> IntArray:
-            """Return the element indices of poses or blocks with ``count`` elements each."""
+        def enumerate_elements(indices: IntArray, count: int) -> IntArray:
+            """Return the indices of the elements of each block."""
             return np.asarray((indices[:, None] * count + np.arange(count)).ravel())
 
         self._edges = edges
         self._position = position
-        self._element_indices = enumerate_numbers(block_indices, unknowns_per_pose**2)
+        # Index of each matrix element to which the edges add, in the list of all blocks
+        self._element_indices = enumerate_elements(block_indices, unknowns_per_pose**2)
         self._diagonal_blocks = np.flatnonzero(block_columns == block_rows)
         self._fronts = []
         front_by_pose = np.repeat(np.arange(len(poses_by_front)), eliminated_counts)
@@ -90,12 +92,12 @@ class NormalEquations:
             self._fronts.append(
                 _FrontalMatrix(
                     unknowns=slice(*eliminated_range * unknowns_per_pose),
-                    remaining_unknowns=enumerate_numbers(remaining_poses, unknowns_per_pose),
+                    remaining_unknowns=enumerate_elements(remaining_poses, unknowns_per_pose),
                     blocks=front_blocks,
                     block_rows=np.searchsorted(poses, block_rows[front_blocks]),
                     block_columns=block_columns[front_blocks] - first_pose,
                     parent_index=parent_index,
-                    rows_in_parent=enumerate_numbers(parent_rows, unknowns_per_pose),
+                    rows_in_parent=enumerate_elements(parent_rows, unknowns_per_pose),
                 )
             )
 
@@ -153,7 +155,8 @@ class NormalEquations:
         solution = np.empty_like(right_hand_sides)
         solution[self._position] = right_hand_sides
         solution = solution.reshape(-1, right_hand_side_count)
-        # Schur complements with their rows, by the index of the front to which they are added
+        # Schur complements with their rows, by the index of the frontal matrix to which they are
+        # added
         schur_complements = defaultdict[int, list[tuple[IntArray, Array]]](list)
         factors = []
         for index, front in enumerate(self._fronts):
@@ -221,10 +224,11 @@ def _find_elimination_order(
     # _build_elimination_tree
     sparse_order = _find_sparse_order(edges)
     remaining_poses, subtree_sizes = _build_elimination_tree(sparse_order[edges])
-    # last_poses[k] is the last pose in the front of pose k. A pose is in the front of its parent if
-    # both are in a small subtree, or if their columns of the Cholesky factor have the same nonzero
-    # rows. To test this, compare the numbers of rows: the rows of the parent include those of the
-    # pose. The loop starts with the last pose, because parents have larger numbers
+    # last_poses[k] is the last pose in the frontal matrix of pose k. A pose shares the frontal
+    # matrix of its parent in the elimination tree if both are in a small subtree, or if their
+    # columns of the Cholesky factor have equal nonzero rows. The rows of the parent include those
+    # of the pose, so it is sufficient to compare the numbers of rows. Parents have larger indices,
+    # so the loop starts with the last pose
     last_poses = np.arange(len(sparse_order))
     for pose in reversed(range(len(sparse_order) - 1)):
         parent = min(remaining_poses[pose])
@@ -266,14 +270,14 @@ def _build_elimination_tree(edges: IntArray) -> tuple[list[set[int]], list[int]]
     Pose k is eliminated in step k. Its remaining poses are the nonzero rows below the diagonal in
     column k of the Cholesky factor: later poses that are connected to it by an edge or by the
     elimination of its children. The parent of a pose is the first of its remaining poses. The last
-    pose has no parent.
+    pose has no parent. ``edges`` has shape (2, m) and contains the elimination steps of both poses.
     """
     remaining_poses: list[set[int]] = [set() for _ in range(int(edges.max()) + 1)]
     for first, second in np.sort(edges, axis=0).T.tolist():
         remaining_poses[first].add(second)
     subtree_sizes = [1] * len(remaining_poses)
-    # Children have smaller numbers than their parent. When the loop reaches a pose, all children
-    # have therefore added their remaining poses to it
+    # In the elimination tree, a child has a smaller index than its parent. When the loop reaches a
+    # pose, all its children have added the poses that remain after their elimination
     for pose in range(len(remaining_poses) - 1):
         parent = min(remaining_poses[pose])
         remaining_poses[parent] |= remaining_poses[pose] - {parent}
